@@ -130,14 +130,7 @@ def per_state(h: Any, y: Array) -> Any:
 
 
 def to_numpy(x: Array) -> np.ndarray:
-    """A NumPy view or copy of `x`, detached from any graph.
-
-    Raises
-    ------
-    TypeError
-        If `x` has no such values: inside `torch.func.vmap` it stands for many arrays, and in a graph that
-        `torch.compile` traces for none.
-    """
+    """The values of `x`, in no graph; a TypeError where it stands for many arrays, as under vmap, or none."""
     found = values(x)
     if found is None or (found is not x and found.ndim != np.ndim(x)):
         where = "in a graph that torch.compile traces" if found is None else "inside torch.func.vmap"
@@ -149,19 +142,12 @@ def to_numpy(x: Array) -> np.ndarray:
 
 
 def differentiable(*arrays: Any) -> bool:
-    """Return True if torch follows one of these tensors, so that NumPy would silently drop what it follows.
-
-    That is a graph (reverse mode), a tangent (forward mode), a transform of `torch.func`, or a graph that
-    `torch.compile` traces.
-    """
+    """Return True if torch follows one of these tensors, by any means: NumPy would silently drop what it follows."""
     return any(map(_is_followed, filter(is_tensor, arrays)))
 
 
 def values(x: Any) -> np.ndarray | None:
-    """Return the values of x, of a tensor (*lanes, *x.shape), the axes first over which `torch.func.vmap` maps.
-
-    None where there are none to be read, in a graph that `torch.compile` traces.
-    """
+    """Return the values of x, of a tensor (*lanes, *x.shape), lanes of vmap first; None where torch.compile traces."""
     if not is_tensor(x):
         return np.asarray(x)
     plain, order = (x, None) if _is_plain(x) else _behind(x)
@@ -175,13 +161,7 @@ def values(x: Any) -> np.ndarray | None:
 
 
 def values_of_times(t: Any, remedy: str) -> np.ndarray:
-    """Return the values of times that say how many steps are made, as `values` does.
-
-    Raises
-    ------
-    TypeError
-        If there are none, with the remedy.
-    """
+    """Return the values of times that say how many steps are made; a TypeError with the remedy if there are none."""
     found = values(t)
     if found is None:
         raise TypeError(
@@ -196,22 +176,13 @@ def has_values(x: Array) -> bool:
 
 
 def one_lane(x: Array) -> np.ndarray:
-    """Return the values of `x`, under `torch.func.vmap` those of the first lane.
-
-    Raises
-    ------
-    TypeError
-        If there are none, in a graph that `torch.compile` traces.
-    """
+    """Return the values of `x`, under `torch.func.vmap` those of the first lane."""
     found = values(x)
     return to_numpy(x) if found is None else found[(0,) * (found.ndim - x.ndim)]
 
 
 def unfollowed(x: Array) -> Array:
-    """Return `x` as a tensor that torch follows by no means, under `torch.func.vmap` its first lane; arrays pass.
-
-    `x.detach()` inside a transform of `torch.func` is a tensor of that transform still.
-    """
+    """Return `x` as a tensor that torch follows by no means, under `torch.func.vmap` its first lane; arrays pass."""
     plain, order = _behind(x)
     if plain is None or isinstance(plain, np.ndarray):
         return detached(x)
@@ -302,24 +273,16 @@ def _is_symbolic(x: Any) -> bool:
 
 
 def finite_states(y: Array, *, in_any_lane: bool = False) -> np.ndarray:
-    """Return True for each of the states y (..., k) that is finite: (...) booleans.
-
-    Of tensors under `torch.func.vmap` those that are finite in all lanes, or in any; where there are no values, all.
-    """
+    """Return True for each of the states y (..., k) that is finite: (...) booleans."""
     if not is_tensor(y):
         return np.isfinite(y).all(-1)
     if y.device.type == "cpu" and (found := values(y)) is not None and found.ndim == y.ndim:
         return np.isfinite(found).all(-1)
-    finite = values(all_finite(y))
+    finite = values(library(y).isfinite(y).all(-1))
     if finite is None:
         return np.ones(y.shape[:-1], dtype=bool)
     hidden = tuple(range(finite.ndim - y.ndim + 1))
     return np.asarray(finite.any(hidden) if in_any_lane else finite.all(hidden))
-
-
-def all_finite(y: Array) -> Array:
-    """Return True for each of the states y (..., k) that is finite: (...) booleans of the library of y."""
-    return library(y).isfinite(y).all(-1)
 
 
 def full_of_nan(y: Array) -> Array:
@@ -350,10 +313,7 @@ def known_finite(y: Array) -> bool:
 
 
 def jvp(f: Callable[[Array], Array], x: Array, v: Array) -> tuple[Array, Array]:
-    """Return f(x) and its derivative at the tensor x along v, by torch, without the warnings that its set-up gives.
-
-    By forward mode; inside `torch.autograd.forward_ad`, which cannot be nested, by reverse mode twice.
-    """
+    """Return f(x) and its derivative at the tensor x along v, by torch, without the warnings that its set-up gives."""
     import torch
 
     _set_up()
@@ -365,6 +325,16 @@ def jvp(f: Callable[[Array], Array], x: Array, v: Array) -> tuple[Array, Array]:
         y, pull = torch.func.vjp(f, x)[:2]
         dy = torch.func.vjp(lambda u: pull(u)[0], torch.zeros_like(y))[1](v)[0]
     return y, dy
+
+
+def jacobian(f: Callable[[Array], Array], x: Array, directions: Array | None = None) -> tuple[Array, Array]:
+    """Return f of a tensor x (..., n), and its derivative (..., m, k) along directions (..., n, k), by default all."""
+    import torch
+
+    if directions is None:
+        directions = torch.eye(x.shape[-1], dtype=x.dtype, device=x.device)
+    found = [jvp(f, x, v + 0 * x.detach()) for v in directions.unbind(-1)]
+    return found[0][0], torch.stack([column for _, column in found], dim=-1)
 
 
 @cache
@@ -402,11 +372,8 @@ def detached(x: Any) -> Any:
 def opaque(function: Any, *x: Array) -> Array:
     """Return a function of NumPy arrays of arrays x, or of tensors, which torch differentiates by its own rules.
 
-    Parameters
-    ----------
-    function : object
-        `value(*arrays)`; `jvp(x, v)`, its derivative along v, of which entries may be None; `vjp(x, w, wanted)`,
-        the derivatives of Σ w·value by those of x that are wanted.
+    It has `value(*arrays)`; `jvp(x, v)`, the derivative along v, of which entries may be None; `vjp(x, w, wanted)`,
+    the derivatives of Σ w·value by those of x that are wanted.
     """
     return _opaque_function().apply(function, *x) if is_tensor(x[0]) else function.value(*x)
 

@@ -17,30 +17,17 @@ from sympflow.arrays import Array, copied, detached, differentiable, stack, to_n
 
 EventFunction = Callable[[float, Array], Any]
 Dense = Callable[[float], Array]  # the state at a time within one step
-
 _EPS = float(np.finfo(float).eps)
 
 
 @dataclass(frozen=True)
 class Event:
-    """A function g(t, y) with SciPy's attributes.
-
-    Attributes
-    ----------
-    g : callable
-        g(t, y) for one state y (2d,) returns a number, zero at the event.
-    limit : float
-        The solution ends at this occurrence; infinite if the event does not end it.
-    direction : float
-        Positive: only where g increases. Negative: only where it decreases. Zero: both.
-    label : str
-        How messages name it.
-    """
+    """A function g(t, y) of one state (2d,), zero at the event, with SciPy's attributes."""
 
     g: EventFunction
-    limit: float = math.inf
-    direction: float = 0.0
-    label: str = "`events`"
+    limit: float = math.inf  # the occurrence at which the solution ends
+    direction: float = 0.0  # positive: only where g increases; negative: where it decreases; zero: both
+    label: str = "`events`"  # in messages
 
     def value(self, t: float, y: Array) -> float:
         value = self.g(t, copied(y))  # a g that writes into its y changes no result
@@ -64,15 +51,7 @@ class Event:
 
 
 def parse(events: Any) -> tuple[Event, ...]:
-    """Events from a function or a list of functions that may bear `terminal` and `direction`.
-
-    `terminal` is True, or the number of occurrences after which to end; `direction` is a number whose sign counts.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If one is not callable, or has a `terminal` that is no count.
-    """
+    """Events from a function or a list of functions that may bear `terminal`, True or a count, and `direction`."""
     if events is None:
         return ()
     functions = (events,) if callable(events) else events
@@ -104,29 +83,16 @@ def _parse_one(g: Any, label: str) -> Event:
 class EventSearch:
     """The events of one run. The integrator hands over every step; the zeros inside are located by Brent's method.
 
-    A zero that falls exactly on the end of a step counts once, in that step; one at t0 counts, as in SciPy.
-
-    Parameters
-    ----------
-    events : tuple of Event
-    max_interval : float, optional
-        Longest time between two samples of the event functions: longer steps are sampled in between, at equal parts.
-        The default is the integrator's choice.
-
-    Attributes
-    ----------
-    end : (float, state) or None
-        Where a terminal event ended the run; `step` returns it too.
-    n_dense : int
-        Evaluations of the dense output.
+    A zero that falls exactly on the end of a step counts once, in that step; one at t0 counts, as in SciPy. Steps
+    longer than `max_interval` are sampled in between, at equal parts; the default is the integrator's choice.
     """
 
     def __init__(self, events: tuple[Event, ...], max_interval: float | None = None) -> None:
         self.events, self.max_interval = events, max_interval
         self.found: list[list[tuple[float, Array]]] = [[] for _ in events]
         self.values: list[float] | None = None
-        self.end: tuple[float, Array] | None = None
-        self.n_dense = 0
+        self.end: tuple[float, Array] | None = None  # the time and state of the terminal event that ended the run
+        self.n_dense = 0  # evaluations of the dense output
 
     @property
     def may_end_run(self) -> bool:
@@ -151,10 +117,7 @@ class EventSearch:
     def step(
         self, t_old: float, y_old: Array, t: float, y: Array, dense: Dense, inner: Sequence[Array] | None = None
     ) -> tuple[float, Array] | None:
-        """Search one step from (t_old, y_old) to (t, y): where the run ends in it, if it does.
-
-        `inner` are the states that divide the step into equal parts, if they are known already.
-        """
+        """Search one step from (t_old, y_old) to (t, y): where the run ends in it, if it does."""
         first = self.values is None
         if first:
             self.values = [event.value(t_old, y_old) for event in self.events]

@@ -25,7 +25,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from functools import cache, cached_property, lru_cache
+from functools import cache, cached_property
 from itertools import pairwise
 from math import comb, factorial, fsum, isfinite, sqrt
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -53,7 +53,6 @@ __all__ = [
 
 GROUP = "sympflow.schemes"
 """The entry-point group in which a distribution announces its schemes: `name = "package.module:SCHEME"`."""
-
 FORCE_GRADIENT, CURVATURE, POLYNOMIAL = 1, 2, 3  # levels of a scheme, or of a flow: what its kicks have beside V
 
 
@@ -77,6 +76,14 @@ class Substep(NamedTuple):
         """Both in turn, of one kind."""
         e = tuple(map(float.__add__, self.polynomial, other.polynomial))
         return Substep(self.kind, self.one + other.one, self.three + other.three, self.five + other.five, e)
+
+
+_COUNTED: dict[str, Callable[[Substep], bool]] = {
+    "force_evaluations": lambda kick: True,
+    "hessian_evaluations": lambda kick: kick.three != 0 or kick.five != 0,
+    "curvature_evaluations": lambda kick: kick.five != 0,
+}
+"""Evaluations, and the kicks that make them."""
 
 
 @dataclass(frozen=True)
@@ -208,23 +215,33 @@ class Scheme:
     @cached_property
     def force_evaluations(self) -> int:
         """Forces per step in a long run, the last kick merged with the next step's first one."""
-        kinds = [kind for kind, *_ in self.substeps]
-        return kinds.count("kick") - (self.first_same_as_last and kinds[0] == "kick")
+        return self.counts["force_evaluations"][0]
 
     @cached_property
     def hessian_evaluations(self) -> int:
         """Force gradients (Hessian–vector products) per step, counted like `force_evaluations`."""
-        return self._kicks_with(lambda g, c: g != 0.0 or c != 0.0)
+        return self.counts["hessian_evaluations"][0]
 
     @cached_property
     def curvature_evaluations(self) -> int:
         """Curvature terms (third derivatives of V) per step, likewise."""
-        return self._kicks_with(lambda g, c: c != 0.0)
+        return self.counts.get("curvature_evaluations", (0,))[0]
 
-    def _kicks_with(self, has: Callable[[float, float], bool]) -> int:
-        with_it = [has(s.three, s.five) for s in self.substeps if s.kind == "kick"]
-        shared = self.first_same_as_last and self.substeps[0][0] == "kick"
-        return sum(with_it[1:-1] if shared else with_it) + (shared and (with_it[0] or with_it[-1]))
+    @cached_property
+    def counts(self) -> dict[str, tuple[int, int, int]]:
+        """Evaluations of a step in a long run, of a step alone, and of the last kick where the next step shares it."""
+        kicks = [s for s in self.substeps if s.kind == "kick"]
+        shared = self.first_same_as_last and self.substeps[0].kind == "kick"
+        found: dict[str, tuple[int, int, int]] = {}
+        for name, has in _COUNTED.items():
+            of = [has(kick) for kick in kicks]
+            if name != "curvature_evaluations" or any(of):
+                found[name] = (
+                    sum(of[shared : len(of) - shared]) + (shared and (of[0] or of[-1])),
+                    sum(of),
+                    shared and of[-1],
+                )
+        return found
 
     @cached_property
     def strang_weights(self) -> tuple[float, ...] | None:
@@ -271,9 +288,9 @@ def _drift_first(drifts: tuple[float, ...], kicks: tuple[float, ...]) -> tuple[t
     return (0.0, *kicks), drifts
 
 
-def _palindrome(half: tuple[float, ...], total: float = 1.0) -> tuple[float, ...]:
-    """Coefficients w₁ … w_m, w₀, w_m … w₁ with the middle one making the sum `total`."""
-    return (*half, total - 2.0 * sum(half), *reversed(half))
+def _palindrome(half: tuple[float, ...]) -> tuple[float, ...]:
+    """Coefficients w₁ … w_m, w₀, w_m … w₁ with the middle one making the sum 1."""
+    return (*half, 1.0 - 2.0 * sum(half), *reversed(half))
 
 
 def _even_palindrome(half: tuple[float, ...]) -> tuple[float, ...]:
@@ -325,12 +342,10 @@ _OMELYAN = (
     "I. P. Omelyan, I. M. Mryglod and R. Folk, Construction of high-order force-gradient algorithms for "
     "integration of motion in classical and quantum systems, Phys. Rev. E 66 (2002) 026701"
 )
-
 _NEARLY_INTEGRABLE = (
     "S. Blanes, F. Casas, A. Farrés, J. Laskar, J. Makazaga and A. Murua, New families of symplectic splitting methods "
     "for numerical integration in dynamical astronomy, Appl. Numer. Math. 68 (2013) 58–72"
 )
-
 _YOSHIDA4_WEIGHT = 1.0 / (2.0 - 2.0 ** (1.0 / 3.0))
 _SUZUKI4_WEIGHT = 1.0 / (4.0 - 4.0 ** (1.0 / 3.0))
 _ROOT19 = sqrt(19.0)
@@ -414,19 +429,13 @@ _TABLE = (
 # fmt: on
 
 SCHEMES: dict[str, Scheme] = {scheme.name: scheme for scheme in _TABLE}
-
 _registered: dict[str, Scheme] = {}
 
 
 def scheme_named(name: str) -> Scheme:
     """Return the scheme of that name: of `SCHEMES`, one that was registered, or that of an installed plug-in.
 
-    Raises
-    ------
-    ValueError
-        If there is none.
-    ImportError
-        If the plug-in that announces it cannot be loaded, or announces something else.
+    A ValueError if there is none; an ImportError if the plug-in cannot be loaded, or announces something else.
     """
     if name in SCHEMES:
         return SCHEMES[name]
@@ -459,12 +468,8 @@ def announced_schemes() -> dict[str, EntryPoint]:
 def checked_scheme(scheme: Any) -> Scheme:
     """Return the scheme, if it is one of finite numbers that is consistent where it declares an order.
 
-    Raises
-    ------
-    TypeError
-        If it is no Scheme, or not of numbers.
-    ValueError
-        If a number is not finite, the order is no positive integer, or kicks or drifts do not add up to 1.
+    A TypeError if it is no Scheme, or not of numbers; a ValueError if a number is not finite, the order is no positive
+    integer, or kicks or drifts do not add up to 1.
     """
     if not isinstance(scheme, Scheme):
         raise TypeError(
@@ -493,30 +498,11 @@ def checked_scheme(scheme: Any) -> Scheme:
 
 def scheme_evaluations(scheme: Scheme, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
     """Evaluations of the force, of force gradients and of curvature terms in a run, as `FixedStep.evaluations`."""
+    counts = scheme.counts.items()
     if backend != "compiled":
-        return {name: (n_steps + n_extra) * whole for name, _, whole, _ in _costs(scheme)}
+        return {name: (n_steps + n_extra) * whole for name, (_, whole, _) in counts}
     # compiled, the last kick of a step is merged with the next step's first, except where a state is saved
-    return {
-        name: n_steps * of_a_step + n_saved * closing + n_extra * whole
-        for name, of_a_step, whole, closing in _costs(scheme)
-    }
-
-
-@lru_cache(maxsize=256)
-def _costs(scheme: Scheme) -> tuple[tuple[str, int, int, int], ...]:
-    """Names of evaluations, with those of a step in a long run, of a step alone, and of the last kick if it is shared.
-
-    Where it is shared, it is executed once more for each state that is saved.
-    """
-    kicks = [(True, s.three != 0 or s.five != 0, s.five != 0) for s in scheme.substeps if s.kind == "kick"]
-    shared = len(kicks) > scheme.force_evaluations
-    counts = [("force_evaluations", scheme.force_evaluations), ("hessian_evaluations", scheme.hessian_evaluations)]
-    if any(scheme.curvatures):
-        counts.append(("curvature_evaluations", scheme.curvature_evaluations))
-    return tuple(
-        (name, of_a_step, sum(kick[i] for kick in kicks), int(shared and kicks[-1][i]))
-        for i, (name, of_a_step) in enumerate(counts)
-    )
+    return {name: n_steps * run + n_saved * closing + n_extra * whole for name, (run, whole, closing) in counts}
 
 
 # pairs of a kick and a drift -----------------------------------------------------------------------------------------

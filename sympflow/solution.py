@@ -15,6 +15,7 @@ from sympflow.arguments import check_flag, told, warn
 from sympflow.arrays import Array, concatenate, is_tensor, to_numpy
 from sympflow.hamiltonian.scales import known_scale, size_of_terms, weights
 from sympflow.integrators.contract import method_text
+from sympflow.integrators.interpolants import Mapped
 from sympflow.show.cards import Answering, Card
 from sympflow.show.pictures import KINDS, trajectory_figure
 from sympflow.show.style import saved
@@ -97,7 +98,6 @@ class Solution(Answering):
             "`t` and `y`, `to_dataframe()`, `to_xarray()` or `to_netcdf(path)`",
         ),
     }
-
     t: np.ndarray
     y: Array
     status: int | np.ndarray
@@ -363,25 +363,22 @@ class Solution(Answering):
         return self
 
 
+def _stored(name: str, read: Callable[[RunStore], Any]) -> property:
+    """A field, kept under a name, that is read from the store unless it is set."""
+
+    def get(sol: StoredSolution) -> Any:
+        known = vars(sol)[name]
+        return read(sol.store) if sol.store is not None and known is None else known
+
+    return property(get, lambda sol, value: vars(sol).update({name: value}))
+
+
 class StoredSolution(Solution):
     """A solution whose outputs are in a store, from which `t` and `y` are read whenever they are asked for."""
 
     store: RunStore | None = None
-
-    def _get_t(self) -> np.ndarray:
-        return self.store.times() if self.store is not None and self._t is None else self._t
-
-    def _set_t(self, t: np.ndarray | None) -> None:
-        self._t: Any = t
-
-    def _get_y(self) -> Array:
-        return self.store.states() if self.store is not None and self._y is None else self._y
-
-    def _set_y(self, y: Array | None) -> None:
-        self._y: Any = y
-
-    t = property(_get_t, _set_t)
-    y = property(_get_y, _set_y)
+    t = _stored("_t", lambda store: store.times())
+    y = _stored("_y", lambda store: store.states())
 
 
 COUNTS = ("backend", "dt", "n_steps", "force_evaluations", "hessian_evaluations", "newton_iterations", "difference")
@@ -445,21 +442,9 @@ def physical_solution(sol: Solution) -> Solution:
         system=doubled.physical,
         y0=limit(sol.y0),
         stats={**sol.stats, "difference": float(apart)},
-        sol=sol.sol and _PhysicalOutput(sol.sol, limit),
+        sol=sol.sol and Mapped(sol.sol, limit),
         y_events=None if sol.y_events is None else [limit(y) for y in sol.y_events],
     )
-
-
-@dataclass(frozen=True)
-class _PhysicalOutput:
-    """The physical part of the dense output of a doubled system."""
-
-    sol: Callable[[Any], Array]
-    limit: Callable[[Array], Array]
-
-    def __call__(self, t: Any) -> Array:
-        y = self.sol(t)
-        return self.limit(y) if np.ndim(t) == 0 else self.limit(y.swapaxes(-1, -2)).swapaxes(-1, -2)
 
 
 def check_solution(sol: object, name: str = "sol") -> None:

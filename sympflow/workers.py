@@ -55,13 +55,7 @@ def available_cores() -> int:
 
 
 def checked_workers(workers: Any) -> Any:
-    """Return the number of workers, −1 being as many as there are cores, or the engine as it is.
-
-    Raises
-    ------
-    ValueError, TypeError
-        If it is neither.
-    """
+    """The number of workers, −1 being as many as there are cores, or the engine as it is."""
     if isinstance(workers, int) and not isinstance(workers, bool):
         if workers == -1:
             return available_cores()
@@ -95,12 +89,7 @@ def _versions() -> dict[str, str]:
 
 
 class PickledTask:
-    """The common part of all calls: pickled once, and unpacked once by each worker; in this process it is sent as is.
-
-    Parameters
-    ----------
-    value : object
-    """
+    """The common part of all calls: pickled once, and unpacked once by each worker; in this process sent as it is."""
 
     def __init__(self, value: Any) -> None:
         self._value, self._packed = value, b""
@@ -112,13 +101,7 @@ class PickledTask:
         return _unpacked(self._packed) if self._packed else self._value
 
     def pack(self) -> bytes:
-        """The object as bytes, with the versions of the program that packs it.
-
-        Raises
-        ------
-        Unpicklable
-            If it cannot be pickled.
-        """
+        """The object as bytes, with the versions of the program; an Unpicklable if it cannot be pickled."""
         if not self._blob:
             self._blob = pickle.dumps((_versions(), _pickled(self._value)))
         return self._blob
@@ -134,11 +117,7 @@ def _sent(packed: bytes) -> PickledTask:
 
 
 def _pickled(value: Any) -> bytes:
-    """Return the pickle of an object.
-
-    It is cloudpickle's, if that is installed, where Python's refuses functions that are in no module, or finds some in
-    the script that runs, which the workers of an engine do not import.
-    """
+    """The pickle of an object; cloudpickle's, if that is installed, of functions that are in no module."""
     refused, data = None, b""
     try:
         data = pickle.dumps(value)
@@ -224,35 +203,7 @@ def mapped(
     processes: bool = False,
     timeout: float | None = None,
 ) -> Iterator[tuple[int, Any]]:
-    """Yield the index of each item and `function(common, item)`, in the order in which they are ready.
-
-    Parameters
-    ----------
-    function : callable
-        Of a module, so that its name is enough to find it.
-    common : object
-        The first argument of all calls: each worker is sent it, and unpacks it once.
-    items : iterable
-    workers : int, object with .map, or callable
-        See the module's docstring.
-    processes : bool
-        True if a number of workers is one of processes, because Python code runs for long; else they are threads.
-    timeout : float, optional
-        Seconds to wait for answers in all, where they come from an `Executor`, from futures, or a number of workers.
-
-    Raises
-    ------
-    LostWorkers
-        If workers die again and again.
-    TimeoutError
-        After `timeout` seconds: what is not begun is cancelled, what is under way is not waited for.
-    TypeError
-        If the `.map` of `workers` does not return the results.
-    Unpicklable
-        If processes cannot be sent `common`.
-    Exception
-        What `function` raises, at the first item for which it does.
-    """
+    """Yield the index of each item and `function(common, item)`, in the order in which they are ready."""
     workers = checked_workers(workers)
     call, left, clock = _Call(function, PickledTask(common)), dict(enumerate(items)), _Clock(timeout)
     answers = _rounds(1 if isinstance(workers, int) and len(left) < 2 else workers, call, processes, clock)
@@ -289,15 +240,7 @@ def mapped(
 
 
 class WorkerPool:
-    """Workers that stay from one map to the next, closed as a context; a number is one of processes.
-
-    Ctrl-C is left to the program that has them: it ends them.
-
-    Parameters
-    ----------
-    workers : int, object with .map, or callable
-        See the module's docstring.
-    """
+    """Workers that stay from one map to the next, closed as a context; a number is one of processes."""
 
     def __init__(self, workers: Any = 1) -> None:
         self.workers = checked_workers(workers)

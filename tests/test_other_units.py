@@ -47,12 +47,12 @@ def of_states(form, units):
     return np.repeat(units[:2], len(FORMS[form][1]) // 2)
 
 
-def assert_alike(measure, form, rtol=1e-8):
+def assert_alike(measure, form, rtol=1e-8, scales=UNITS):
     """Assert that a measure of a system and its units, free of dimensions, is the same in all units, without a word."""
     expected = np.asarray(measure(scaled(form), (1.0, 1.0, 1.0)), dtype=float)
     assert np.isfinite(expected).any()
     atol = rtol * np.nanmax(np.abs(expected)) + 1e-13  # what is rounding differs
-    for units in UNITS:
+    for units in scales:
         found = measure(scaled(form, units), units)
         np.testing.assert_allclose(found, expected, rtol=0, atol=atol, err_msg=str(units))
 
@@ -80,7 +80,7 @@ def test_methods(method):
     adaptive = "rtol" in sympflow.get(method)().options()
     forms = [form for form in FORMS if applies(method, form)]
     assert "well" in forms
-    for form in forms[: 1 if adaptive else None]:
+    for k, form in enumerate(forms[: 1 if adaptive else None]):
         told = []
 
         def end(system, units, form=form, told=told):
@@ -92,7 +92,7 @@ def test_methods(method):
             assert sol.success, sol.message
             return sol.y[:, -1] / of_states(form, units)
 
-        assert_alike(end, form, 1e-5 if adaptive else 1e-9)
+        assert_alike(end, form, 1e-5 if adaptive else 1e-9, UNITS[k % 2 :: 2])
         assert all(each == told[0] for each in told)
         assert told[0] == [] or (method, told[0]) == ("euler", [True])
 

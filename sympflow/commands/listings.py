@@ -31,16 +31,10 @@ def systems(ctx: typer.Context, quiet: Quiet = False) -> None:
             primed = sum(f.stages is not None for f in flows)
             trained = [f"{f.kind} (Δt = {f.dt:g})" for f in flows if f.stages is None]
             trained += [f"{primed} primed"] if primed else []
-            rows.append(
-                (
-                    name,
-                    textwrap.shorten(str(system.symbols.H), 72, placeholder=" …") if system.symbols else "",
-                    ", ".join(f"{k} = {shown(v)}" for k, v in parameters(name).items()) or "–",
-                    f"{system.t_span[0]:g} … {system.t_span[1]:g}",
-                    f"{system.dt:g}",
-                    ", ".join(trained) or "–",
-                )
-            )
+            formula = textwrap.shorten(str(system.symbols.H), 72, placeholder=" …") if system.symbols else ""
+            params = ", ".join(f"{k} = {shown(v)}" for k, v in parameters(name).items()) or "–"
+            span = f"{system.t_span[0]:g} … {system.t_span[1]:g}"
+            rows.append((name, formula, params, span, f"{system.dt:g}", ", ".join(trained) or "–"))
         print_table(("name", "H", "parameters", "interval", "step", "trained flows"), rows)
 
 

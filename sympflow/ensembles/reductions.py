@@ -100,10 +100,7 @@ class Final(Reduction):
 
 @dataclass(frozen=True)
 class EnergyError(Reduction):
-    """The largest relative energy error |H(y(t)) − H(y0)| / |H(y0)| along each orbit: `energy_error`.
-
-    It is relative to the `energy_scale` of `sympflow.metrics.energy`, and absolute where that is missing.
-    """
+    """The largest error |H(y(t)) − H(y0)| along each orbit over its `energy_scale`, if there is one: `energy_error`."""
 
     def check(self, system: HamiltonianSystem) -> None:
         system.check_conservative("so its energy is lost and no error", "use another `reduce`, such as 'final'")
@@ -129,11 +126,7 @@ class EnergyError(Reduction):
 
 @dataclass(frozen=True)
 class OfFunction(Reduction):
-    """A user's function of (t (m,), y (2d, m)) of one orbit, which returns a number, an array, or a dict of such.
-
-    The shapes are those of the first orbit, and numbers are complex if its are. An orbit for which the function raises,
-    or returns another shape, or imaginary parts where the first has none, has failed, with that message.
-    """
+    """A user's function of (t (m,), y (2d, m)) of one orbit: a number, an array, or a dict of such, as of the first."""
 
     function: Callable[[np.ndarray, np.ndarray], Any]
     found: Fields = field(default_factory=dict, compare=False)
@@ -142,13 +135,7 @@ class OfFunction(Reduction):
     takes_params: ClassVar[bool] = True
 
     def fields(self, problem: Chunk) -> Fields:
-        """Find out the fields by the first orbit that does not fail.
-
-        Raises
-        ------
-        ValueError, TypeError
-            If the function raises there, or what it returns is no array of numbers; or if all first orbits fail.
-        """
+        """Find out the fields by the first orbit that does not fail; a ValueError or TypeError where there are none."""
         for i, t, y in problem.rows(0, MOST_TRIED).orbits():
             if not np.isfinite(y).all():
                 continue

@@ -18,12 +18,13 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
+from sympflow.arguments import check_counts
 from sympflow.flow.layers import Drift, Kick, Layer
 from sympflow.flow.potentials import Potential, Time
 from sympflow.flow.primed_potentials import KINETIC, POTENTIAL, PrimedPotential
 from sympflow.flow.records import MAX_DEGREE, Refused, checked_integer
 from sympflow.flow.sympflow import SystemFlow
-from sympflow.flow.weights import Kept, checked_device, checked_dtype, doubles
+from sympflow.flow.weights import Kept, doubles
 from sympflow.hamiltonian.fingerprint import check_for_flows
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.schemes import SCHEMES, scheme_evaluations
@@ -35,12 +36,10 @@ if TYPE_CHECKING:  # a flow needs it only to be compiled
 class ClockPotential(Potential):
     """Σ_k c_k t^(3+2k) B^(k+1)/(k+1), B the last momentum, of d + 1 degrees of freedom; `numbers` are the c_k."""
 
-    def __init__(
-        self, ndof: int, terms: int, dtype: torch.dtype = torch.float64, device: torch.device | str | None = None
-    ) -> None:
+    def __init__(self, ndof: int, terms: int, **like: Any) -> None:
         super().__init__()
         self.ndof = ndof
-        self.numbers = nn.Parameter(torch.zeros(terms, dtype=dtype, device=device))
+        self.numbers = nn.Parameter(torch.zeros(terms, **like))
 
     def value(self, t: Time, x: Tensor) -> Tensor:
         B = x[-1]
@@ -50,9 +49,6 @@ class ClockPotential(Potential):
         B = x[-1]
         advance = sum((c * t ** (3 + 2 * k) * B**k for k, c in enumerate(self.numbers)), 0 * B)
         return torch.cat([torch.zeros_like(x[:-1]), advance[None]])
-
-    def to_dict(self) -> dict[str, Any]:
-        return {"type": "clock"}
 
 
 @dataclass(frozen=True)
@@ -88,17 +84,15 @@ class ClockedFlow(SystemFlow):
         terms: int = 8,
         dt: float = 1.0,
         system: HamiltonianSystem | None = None,
-        dtype: torch.dtype = torch.float64,
-        device: torch.device | str | None = None,
+        **like: Any,
     ) -> None:
-        super().__init__(ndof, dt)
+        super().__init__(ndof, dt, **like)
         table = SCHEMES.get(scheme)
         if table is None or not table.symmetric or any(table.gradients) or table.nystrom:
             raise ValueError(f"`scheme` {scheme!r} is not a symmetric one without force gradients: take 'leapfrog'.")
-        if isinstance(terms, bool) or not isinstance(terms, int) or terms < 1:
-            raise ValueError(f"`terms` must be a positive integer; got {terms!r}.")
+        check_counts(terms=terms)
         self.scheme = table
-        self.clock = ClockPotential(ndof, terms, checked_dtype(dtype), checked_device(device))
+        self.clock = ClockPotential(ndof, terms, **self._like)
         self._numbers: Kept[tuple[float, ...]] = Kept([self.clock._parameters])
         maps: list[Layer] = []
         for kind, c, *_ in table.substeps:
@@ -124,7 +118,7 @@ class ClockedFlow(SystemFlow):
         """Return the c_k that the clock has now, the last one first."""
         return self._numbers.current(lambda: tuple(doubles(self.clock.numbers)[::-1].tolist()))
 
-    def _compiled_for(self, system: HamiltonianSystem) -> ClockedFlowKernel:
+    def _compiled_for(self, system: HamiltonianSystem, compensated: bool) -> ClockedFlowKernel:
         from sympflow.flow.loops import ClockedFlowKernel
 
         return ClockedFlowKernel(self.scheme, system, self.advance)

@@ -20,14 +20,13 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from sympflow.arguments import floats, plain
+from sympflow.arguments import checked_count, floats, plain
 from sympflow.arrays import per_state
 from sympflow.flow.flow_map import check_system
 from sympflow.flow.layers import OwnLayer
 from sympflow.flow.potentials import Time
 from sympflow.flow.records import checked_integer
 from sympflow.flow.sympflow import SystemFlow
-from sympflow.flow.weights import checked_device, checked_dtype
 from sympflow.hamiltonian import collocation
 from sympflow.hamiltonian.fingerprint import check_for_flows
 from sympflow.hamiltonian.system import HamiltonianSystem
@@ -46,13 +45,9 @@ TOLERANCE = 1e-10
 class CollocationLayer(OwnLayer):
     """One step χ_{t/m} of a Gauss method."""
 
-    kind = "collocation"
-
-    def forward(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
-        return self._step(t / self.flow.steps, q, p)
-
-    def inverse(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
-        return self._step(-t / self.flow.steps, q, p)
+    def moved(self, t: Time, y: Tensor, back: bool) -> Tensor:
+        h = (-t if back else t) / self.flow.steps
+        return self.flow.ended(y, self.flow.stages_of(y, h)[0], h)
 
     def pull_back(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         flow, y, h = self.flow, torch.cat([q, p]).T, -t / self.flow.steps
@@ -60,20 +55,8 @@ class CollocationLayer(OwnLayer):
         K, _ = flow.stages_of(y, h)  # of the way back, whose stages are those of the step
         A = torch.as_tensor(flow.tableau[0], dtype=y.dtype, device=y.device)
         mean = (flow.weights * flow.bound_system.hamiltonian(y[:, None, :] + A @ K)).sum(-1)
-        return (*_halves(flow.ended(y, K, h).T), mean / flow.steps)
-
-    def _step(self, h: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
-        y = torch.cat([q, p]).T
-        return _halves(self.flow.ended(y, self.flow.stages_of(y, h)[0], h).T)
-
-    def to_dict(self) -> dict[str, Any]:
-        return {"kind": self.kind}
-
-
-def _halves(y: Tensor) -> tuple[Tensor, Tensor]:
-    """The q and p of columns (2d, N)."""
-    q, p = y.chunk(2)
-    return q, p
+        q, p = flow.ended(y, K, h).T.chunk(2)
+        return q, p, mean / flow.steps
 
 
 class CollocatedFlow(SystemFlow):
@@ -122,13 +105,13 @@ class CollocatedFlow(SystemFlow):
         dtype: torch.dtype = torch.float64,
         device: torch.device | str | None = None,
     ) -> None:
-        super().__init__(ndof, dt)
-        self.stages, self.steps = _count("stages", stages, MOST_STAGES), _count("steps", steps, MOST_STEPS)
+        super().__init__(ndof, dt, dtype, device)
+        self.stages = checked_count("stages", plain(stages), 1, MOST_STAGES, f"an integer from 1 to {MOST_STAGES}")
+        self.steps = checked_count("steps", plain(steps), 1, MOST_STEPS, f"an integer from 1 to {MOST_STEPS}")
         self.tableau = collocation.gauss_legendre(self.stages)
         _, B, scale = self.tableau
         weights = [b * unit for b, unit in zip(B, scale, strict=True)] if self.stages > 2 else list(B)
-        like: dict[str, Any] = {"dtype": checked_dtype(dtype), "device": checked_device(device)}
-        self.register_buffer("weights", torch.tensor(weights, **like), persistent=False)
+        self.register_buffer("weights", torch.tensor(weights, **self._like), persistent=False)
         # A tuple, not a ModuleList: the layers own nothing.
         self.layers = tuple(CollocationLayer(self) for _ in range(self.steps))
         self._made_of(system)
@@ -150,7 +133,12 @@ class CollocatedFlow(SystemFlow):
                     "`steps` is needed, for the system has no domain over which errors could be compared: give it, or "
                     "`states`."
                 )
-            steps = enough_steps(system, flow.tableau, flow.dt, _checked_states(states, system.ndof))
+            x, width = floats("states", states), 2 * system.ndof
+            if x.ndim != 2 or x.shape[1] != width or not len(x) or not np.isfinite(x).all():
+                raise ValueError(
+                    f"`states` must be finite and of shape (n, {width}); got {x.shape}: give some, or `steps`."
+                )
+            steps = enough_steps(system, flow.tableau, flow.dt, x)
         made = cls(system.ndof, stages, steps, system=system, **like)
         made.domain = system.domain
         if system.domain is not None:
@@ -175,7 +163,7 @@ class CollocatedFlow(SystemFlow):
         """The states (N, 2d) at the end of that step."""
         return collocation.advanced(self.bound_system, self.tableau, y, K, per_state(h, y))
 
-    def _compiled_for(self, system: HamiltonianSystem) -> CollocatedFlowKernel:
+    def _compiled_for(self, system: HamiltonianSystem, compensated: bool) -> CollocatedFlowKernel:
         from sympflow.flow.loops import CollocatedFlowKernel
 
         return CollocatedFlowKernel(system, self.tableau, self.steps)
@@ -195,20 +183,6 @@ class CollocatedFlow(SystemFlow):
     def bound_system(self) -> HamiltonianSystem:
         """The system whose H the flow uses."""
         return self._binding.system
-
-
-def _count(name: str, value: Any, most: int) -> int:
-    value = plain(value)
-    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= most:
-        raise ValueError(f"`{name}` must be an integer from 1 to {most}; got {value!r}.")
-    return value
-
-
-def _checked_states(states: ArrayLike, ndof: int) -> np.ndarray:
-    x = floats("states", states)
-    if x.ndim != 2 or x.shape[1] != 2 * ndof or not len(x) or not np.isfinite(x).all():
-        raise ValueError(f"`states` must be finite and of shape (n, {2 * ndof}); got {x.shape}: give some, or `steps`.")
-    return x
 
 
 @np.errstate(all="ignore")  # of steps that are too long

@@ -14,7 +14,6 @@ import json
 import math
 import os
 import struct
-import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -26,24 +25,11 @@ from safetensors.torch import save as save_tensors
 from torch import Tensor, nn
 
 from sympflow._version import __version__
-from sympflow.arguments import naming_path, put_file, writable
+from sympflow.arguments import naming_path, put_file, warn, writable
+from sympflow.flow import records
 from sympflow.flow.families import family_of
 from sympflow.flow.potentials import Unregistered
-from sympflow.flow.records import (
-    FORMAT,
-    KEY,
-    MAX_DT,
-    MAX_HEADER,
-    MAX_WIDTH,
-    MIN_DT,
-    SUM,
-    Provenance,
-    Refused,
-    checked_integer,
-    checked_path,
-    read,
-    text_checksum,
-)
+from sympflow.flow.records import KEY, MAX_DT, MIN_DT, Provenance, Refused, checked_integer, checked_path, text_checksum
 from sympflow.flow.weights import checked_device, checksum
 from sympflow.hamiltonian.system import HamiltonianSystem
 
@@ -68,7 +54,7 @@ def write(
         if not torch.isfinite(value).all():
             raise ValueError(f"`flow` has weights that are not finite ({name}): train it again before saving.")
     record = {
-        "format": FORMAT,
+        "format": records.FORMAT,
         "version": __version__,
         "kind": kind,
         "architecture": architecture,
@@ -80,11 +66,10 @@ def write(
         if provenance.certified.weights == record["checksum"]:
             record["certificate"] = provenance.certified.to_dict()
         else:
-            warnings.warn(
+            warn(
                 "`flow` was changed, or converted to another precision, after its certificate was computed, which is "
                 "therefore not stored: compute it again by flow.certificate(system) before saving.",
                 RuntimeWarning,
-                stacklevel=3,
             )
     record = _finite(record)
     try:
@@ -92,11 +77,11 @@ def write(
     except Refused as reason:
         raise ValueError(f"`flow` cannot be saved as it is: {reason}. Set it right first.") from None
     text = json.dumps(record, allow_nan=False, separators=(",", ":"))
-    content = save_tensors(tensors, {KEY: text, SUM: text_checksum(text)})
-    if (length := struct.unpack("<Q", content[:8])[0]) > MAX_HEADER:
+    content = save_tensors(tensors, {KEY: text, records.SUM: text_checksum(text)})
+    if (length := struct.unpack("<Q", content[:8])[0]) > records.MAX_HEADER:
         raise ValueError(
-            f"`flow` cannot be saved as it is: its description takes {length:,} bytes, more than {MAX_HEADER:,}. "
-            "Describe its domain with fewer numbers, for instance a Tube around fewer states."
+            f"`flow` cannot be saved as it is: its description takes {length:,} bytes, more than "
+            f"{records.MAX_HEADER:,}. Describe its domain with fewer numbers, for instance a Tube around fewer states."
         )
     with naming_path(writable(file)):
         put_file(file, content, durable=False)
@@ -115,10 +100,7 @@ def _finite(value: Any) -> Any:
 
 
 def load(
-    path: str | os.PathLike[str],
-    *,
-    system: HamiltonianSystem | None = None,
-    device: torch.device | str | None = None,
+    path: str | os.PathLike[str], *, system: HamiltonianSystem | None = None, device: torch.device | str | None = None
 ) -> Any:
     """Read a flow from a file that `flow.save` wrote.
 
@@ -148,7 +130,7 @@ def load(
     """
     file, device = checked_path(path), checked_device(device)
     try:
-        content, header, record, altered = read(file)
+        content, header, record, altered = records.read(file)
         flow = _build(record, _dtype_of(header))
         _fill(flow, content, header, record)
         provenance = Provenance.of_record(record, flow.ndof)
@@ -187,7 +169,7 @@ def _build(record: dict[str, Any], dtype: torch.dtype) -> Any:
         raise Refused("its architecture is missing")
     if isinstance(dt, bool) or not isinstance(dt, (int, float)) or not MIN_DT <= dt <= MAX_DT:
         raise Refused(f"its dt {dt!r} is not a number between {MIN_DT:g} and {MAX_DT:g}")
-    ndof = checked_integer(plan.get("ndof"), "ndof", MAX_WIDTH)
+    ndof = checked_integer(plan.get("ndof"), "ndof", records.MAX_WIDTH)
     try:
         return family_of(record["kind"], plan).from_architecture(ndof, plan, dt, dtype)
     except Unregistered as error:

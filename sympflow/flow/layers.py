@@ -10,13 +10,10 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import torch
 from torch import Tensor, nn
 
-from sympflow.compiler import NotCompiled
-from sympflow.flow.potentials import NO_NETWORK, Potential, Time, by_time
+from sympflow.flow.potentials import Potential, Time, by_time
 
 if TYPE_CHECKING:  # a flow needs it only to be compiled
     from sympflow.hamiltonian.system import HamiltonianSystem
-    from sympflow.kernels.network_tangents import TrainedNetwork
-    from sympflow.kernels.networks import NetworkLayer
 
 
 class Layer(nn.Module):
@@ -53,17 +50,9 @@ class Layer(nn.Module):
     def to_dict(self) -> dict[str, Any]:
         raise NotImplementedError
 
-    def network(self) -> NetworkLayer:
-        """Return its weights for compiled loops; a ValueError if it is not a kick or a drift with an MLP potential."""
-        raise NotCompiled(NO_NETWORK)
-
-    def trained(self) -> TrainedNetwork | None:
-        """Return its network for compiled derivatives by the parameters; None if there are none."""
-        return None
-
 
 class OwnLayer(Layer):
-    """A layer that takes its numbers and functions from its flow."""
+    """A layer that takes its numbers and functions from its flow, and moves rows of states by `moved`."""
 
     def __init__(self, flow: Any) -> None:
         super().__init__()
@@ -73,6 +62,17 @@ class OwnLayer(Layer):
     @property
     def flow(self) -> Any:
         return self._of[0]
+
+    def moved(self, t: Time, y: Tensor, back: bool) -> Tensor:
+        """φ_t(y), or φ_t⁻¹(y), of rows (N, 2d)."""
+        raise NotImplementedError
+
+    def forward(self, t: Time, q: Tensor, p: Tensor, back: bool = False) -> tuple[Tensor, Tensor]:
+        q, p = self.moved(t, torch.cat([q, p]).T, back).T.chunk(2)
+        return q, p
+
+    def inverse(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
+        return self.forward(t, q, p, back=True)
 
 
 class Binding:
@@ -119,11 +119,12 @@ class PotentialLayer(Layer):
     def _moved(self, q: Tensor, p: Tensor, g: Tensor) -> tuple[Tensor, Tensor]:
         return (q, p - g) if self.kind == "kick" else (q + g, p)
 
-    def forward(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
-        return self._moved(q, p, self.potential.impulse(t, self._argument(q, p)))
+    def forward(self, t: Time, q: Tensor, p: Tensor, back: bool = False) -> tuple[Tensor, Tensor]:
+        g = self.potential.impulse(t, self._argument(q, p))
+        return self._moved(q, p, -g if back else g)
 
     def inverse(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
-        return self._moved(q, p, -self.potential.impulse(t, self._argument(q, p)))
+        return self.forward(t, q, p, back=True)
 
     def tangent(self, t: Time, q: Tensor, p: Tensor, dq: Tensor, dp: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         g, dg = self.potential.impulse_and_tangent(t, self._argument(q, p), self._argument(dq, dp))
@@ -135,12 +136,6 @@ class PotentialLayer(Layer):
 
     def to_dict(self) -> dict[str, Any]:
         return {"kind": self.kind, "potential": self.potential.to_dict()}
-
-    def network(self) -> NetworkLayer:
-        return self.potential.network(self.kind == "kick")
-
-    def trained(self) -> TrainedNetwork | None:
-        return self.potential.trained()
 
 
 class Kick(PotentialLayer):

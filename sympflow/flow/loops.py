@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -27,10 +27,7 @@ __all__ = ["ClockedFlowKernel", "CollocatedFlowKernel", "PrimedFlowKernel", "Spl
 
 
 class PrimedFlowKernel(Kernel):
-    """Compiled loops of a primed flow on its system, a `Kernel`; a step h < 0 is the inverse of ψ̄_|h|.
-
-    A flow with a processor, ψ̄ = χ ∘ K ∘ χ⁻¹, starts a run by χ⁻¹, makes its steps by K, and applies χ to each output.
-    """
+    """Compiled loops of a primed flow on its system; a step h < 0 is the inverse of ψ̄_|h|."""
 
     def __init__(self, tables: Tables, system: HamiltonianSystem, compensated: bool = False) -> None:
         system.friction.check_sums(compensated)
@@ -51,7 +48,8 @@ class PrimedFlowKernel(Kernel):
         if not self._tables.processed:
             return self._kernel(task.h).runs(task._replace(h=abs(task.h)))
         tables, (N, size) = self._processed(task.h, task.t0), task.y0.shape
-        work = _stages(tables, task) * size / 2 / (self._splitting.abreast if N > 1 else 1.0)
+        stages = tables[1].shape[1] + tables[2].shape[1] * -(-len(task.save) // max(task.n_steps, 1))
+        work = stages * size / 2 / (self._splitting.abreast if N > 1 else 1.0)
         rollout = partial(self._functions().run_processed, *tables)
         return run_states(rollout, task, size * (1 + self._compensated), work)
 
@@ -99,11 +97,7 @@ class PrimedFlowKernel(Kernel):
         return self._splitting.functions(tables.level, self._compensated, tables.monomials, ranges=self._ranges)
 
     def _processed(self, h: float, t0: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The tables of χ⁻¹, of a run of K, and of χ, of steps |h|, or for h < 0 of their inverse.
-
-        That of χ begins with the last stage of K. In a driven system the time
-        moves with the drifts of χ⁻¹ too: K begins before t0 by those of χ.
-        """
+        """The tables of χ⁻¹, of a run of K, and of χ from the last stage of K on; for h < 0 of the inverse."""
         loops = self._splitting
 
         def stages() -> tuple[StageTable, StageTable, StageTable]:
@@ -116,7 +110,7 @@ class PrimedFlowKernel(Kernel):
 
         if loops.driven:
             before, kernel, after = self._tables.kept(("stages", h), stages)
-            start = t0 + float(before.drifts.sum())
+            start = t0 + float(before.drifts.sum())  # the time moves with the drifts of χ⁻¹ too
             return loops.rows(before, h, t0), loops.rows(kernel, abs(h), start), loops.rows(after, h, start)
 
         def make() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -126,17 +120,8 @@ class PrimedFlowKernel(Kernel):
         return self._tables.kept(("processed", h, loops.values), make)
 
 
-def _stages(tables: Sequence[np.ndarray], task: Task) -> int:
-    """Stages of a step of a run with a processor, with its share of those of the outputs."""
-    return tables[1].shape[1] + tables[2].shape[1] * -(-len(task.save) // max(task.n_steps, 1))
-
-
 class SplitFlowKernel(Kernel):
-    """Compiled loops of a flow made of exact flows of parts, for Δt = `dt`; a step h < 0 is the inverse of ψ̄_|h|.
-
-    ``maps.maps(t)`` are those of a step, for t < 0 of the inverse, the same object for the same t, and
-    ``maps.coefficients(back)`` those of all steps: see `PartsLoops.step_by_coefficients`.
-    """
+    """Compiled loops of a flow made of exact flows of parts, by its `KeptMaps`; h < 0 is the inverse of ψ̄_|h|."""
 
     def __init__(self, maps: Any, parts: ExactParts, dt: float) -> None:
         from sympflow.kernels.parts_loops import parts_loops
@@ -159,11 +144,7 @@ class SplitFlowKernel(Kernel):
 
 
 class ClockedFlowKernel(Kernel):
-    """Compiled loops of a flow with a trained clock, a `Kernel`; states are [q, t, p, B], of the transformed system.
-
-    B is constant and nothing depends on t, so n steps of the clock are n times one, added where a state is kept:
-    ``advance(s, B)`` of steps s.
-    """
+    """Compiled loops of a flow with a trained clock, of states [q, t, p, B]: n steps of the clock are n times one."""
 
     saves_finite = False
 

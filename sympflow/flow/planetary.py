@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -28,7 +28,7 @@ from sympflow.flow.layers import OwnLayer
 from sympflow.flow.potentials import Time, by_time
 from sympflow.flow.records import Refused, checked_integer
 from sympflow.flow.sympflow import SystemFlow
-from sympflow.flow.weights import Kept, check_compilable, checked_device, checked_dtype, doubles
+from sympflow.flow.weights import Kept, doubles
 from sympflow.hamiltonian.planets import Frame, frame_of
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.protocol import Kernel
@@ -42,21 +42,9 @@ AT_DT = 1e-12  # relative difference of a time from Δt that is rounding
 BEFORE, STEPS, AFTER = slice(0, 1), slice(1, 2), slice(2, 3)
 
 
-class _Kept(NamedTuple):
-    """χ, its inverse, and compiled loops with a frame by True where sums are compensated, of the numbers now."""
-
-    processor: Substeps
-    inverse: Substeps
-    kernels: dict[bool, tuple[Frame, Kernel]]
-
-
 def at_dt(dt: float, t: Any) -> Any:
     """Return True for times that are Δt, or −Δt."""
     return abs(abs(t) - dt) <= AT_DT * dt
-
-
-def _is_period(value: Any) -> bool:
-    return isinstance(value, float) and 0 < value < math.inf
 
 
 def processor_of(kicks: Sequence[float], gradients: Sequence[float]) -> Substeps:
@@ -79,26 +67,15 @@ class PlanetLayer(OwnLayer):
         super().__init__(flow)
         self.substep = kick, drift, 0.0
 
-    def forward(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
-        return self._moved([self.substep], t, q, p)
-
-    def inverse(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
-        return self._moved(reversed_substeps([self.substep]), t, q, p)
-
-    def _moved(self, substeps: Substeps, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
-        y = torch.cat([q, p]).T
-        time = t + 0 * y[:, 0]
-        y = self.flow.frame.moved(y, sum(a for _, a, _ in substeps) * time, (substeps, time))
-        return y.T.chunk(2)
+    def moved(self, t: Time, y: Tensor, back: bool) -> Tensor:
+        substeps, time = reversed_substeps([self.substep]) if back else [self.substep], t + 0 * y[:, 0]
+        return self.flow.frame.moved(y, sum(a for _, a, _ in substeps) * time, (substeps, time))
 
     def pull_back(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         q, p = self.inverse(t, q, p)
         y, (kick, drift, _) = torch.cat([q, p]).T, self.substep
         kepler = self.flow.frame.kepler_energy(y)
         return q, p, kick * (self.flow.system.hamiltonian(y) - kepler) if kick else drift * kepler
-
-    def to_dict(self) -> dict[str, Any]:
-        return {"kind": "kepler"}
 
 
 class KeplerFlow(SystemFlow):
@@ -123,15 +100,13 @@ class KeplerFlow(SystemFlow):
         dt: float = 1.0,
         periods: Sequence[float] | None = None,
         system: HamiltonianSystem | None = None,
-        dtype: torch.dtype = torch.float64,
-        device: torch.device | str | None = None,
+        **like: Any,
     ) -> None:
-        super().__init__(ndof, dt)
-        kind: dict[str, Any] = {"dtype": checked_dtype(dtype), "device": checked_device(device)}
-        self.register_buffer("kicks", torch.zeros(2 * reach, **kind))
-        self.register_buffer("gradients", torch.zeros(n_gradients, **kind))
+        super().__init__(ndof, dt, **like)
+        self.register_buffer("kicks", torch.zeros(2 * reach, **self._like))
+        self.register_buffer("gradients", torch.zeros(n_gradients, **self._like))
         self.periods = None if periods is None else tuple(map(float, periods))
-        self._kept: Kept[_Kept] = Kept([self._buffers])
+        self._kept: Kept[tuple[Substeps, Substeps]] = Kept([self._buffers])
         # A tuple, not a ModuleList: the layers own no numbers.
         self.layers = tuple(PlanetLayer(self, *m) for b, a, _ in BETWEEN for m in ((b, 0.0), (0.0, a)) if any(m))
         self._made_of(system)
@@ -151,7 +126,7 @@ class KeplerFlow(SystemFlow):
 
     def _frame_of(self, system: HamiltonianSystem) -> Frame:
         """The frame of a system, whose planets are on the orbits for which the numbers hold."""
-        frame = frame_of(system.local, system.y0)
+        frame = frame_of(system)
         if frame is None or not frame.jacobi:
             raise ValueError(
                 f"`system` {system.name!r} has no planets in Jacobi's coordinates, which the flow needs: make it by "
@@ -202,10 +177,10 @@ class KeplerFlow(SystemFlow):
     def _moved(self, t: float | Tensor, x: Tensor, parts: slice) -> Tensor:
         """States after some of χ⁻¹, K and χ, or of the scheme before Δt, for t < 0 of its inverse."""
         time = torch.as_tensor(t, dtype=x.dtype, device=x.device).expand(x.shape[:-1])
-        kept, whole = self._kept.current(self._frozen), at_dt(self.dt, to_values(time))
+        (processor, inverse), whole = self._kept.current(self._frozen), at_dt(self.dt, to_values(time))
         passed = time if parts not in (BEFORE, AFTER) else 0 * time
         ends: list[Tensor] = []
-        for is_trained, pieces in ((True, (kept.inverse, STEP, kept.processor)), (False, ([], BETWEEN, []))):
+        for is_trained, pieces in ((True, (inverse, STEP, processor)), (False, ([], BETWEEN, []))):
             if (whole == is_trained).any():
                 timed = [*zip(pieces, (time.abs(), time, time.abs()), strict=True)]
                 ends.append(self.frame.moved(x, passed, *timed[parts]))
@@ -215,26 +190,23 @@ class KeplerFlow(SystemFlow):
 
     # its runs -------------------------------------------------------------------------------------------------
 
-    def _frozen(self) -> _Kept:
+    def _frozen(self) -> tuple[Substeps, Substeps]:
+        """χ and its inverse, of the numbers now."""
         processor = processor_of(*(doubles(x).tolist() for x in (self.kicks, self.gradients)))
-        return _Kept(processor, reversed_substeps(processor), {})
+        return processor, reversed_substeps(processor)
 
     def kernel_for(self, system: HamiltonianSystem, compensated: bool = False) -> Kernel:
-        check_compilable(self.dtype, self.device)
-        flow, kept = self.bound(system), self._kept.current(self._frozen)
-        known = kept.kernels.get(compensated)
-        if known is None or known[0] is not flow.frame:
-            from sympflow.kernels.kepler import KeplerFlowKernel, KeplerKernel, kepler_loops
+        return self._loops_for(system, compensated)
 
-            loops = kepler_loops(flow.frame)
-            trained = KeplerKernel(loops, STEP, kept.inverse, kept.processor, compensated)
-            between = KeplerKernel(loops, BETWEEN, compensated=compensated)
-            known = flow.frame, KeplerFlowKernel(partial(at_dt, self.dt), trained, between)
-            kept.kernels[compensated] = known
-        return known[1]
+    def _compiled_for(self, system: HamiltonianSystem, compensated: bool) -> Kernel:
+        from sympflow.kernels.kepler import KeplerFlowKernel, KeplerKernel, kepler_loops
+
+        (processor, inverse), loops = self._kept.current(self._frozen), kepler_loops(self.frame)
+        trained = KeplerKernel(loops, STEP, inverse, processor, compensated)
+        return KeplerFlowKernel(partial(at_dt, self.dt), trained, KeplerKernel(loops, BETWEEN, compensated=compensated))
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
-        kicks = sum(kick != 0 for kick, *_ in self._kept.current(self._frozen).processor)
+        kicks = sum(kick != 0 for kick, *_ in self._kept.current(self._frozen)[0])
         forces = n_steps + kicks * (1 + n_saved) + sum(kick != 0 for kick, *_ in BETWEEN) * n_extra
         return {"force_evaluations": forces, "hessian_evaluations": 2 * len(self.gradients) * (1 + n_saved)}
 
@@ -244,9 +216,10 @@ class KeplerFlow(SystemFlow):
     @classmethod
     def checked_plan(cls, plan: dict[str, Any], ndof: int) -> dict[str, Any]:
         reach = checked_integer(plan.get("reach"), "reach", MOST_REACH)
-        gradients, periods = plan.get("gradients"), plan.get("periods")
+        gradients, periods = plan.get("gradients"), plan.get("periods", ())
         if gradients != 0:
             gradients = checked_integer(gradients, "number of force gradients", 2 * reach)
-        if not (isinstance(periods, list) and len(periods) == ndof // 3 - 1 and all(map(_is_period, periods))):
+        known = isinstance(periods, list) and all(isinstance(p, float) and 0 < p < math.inf for p in periods)
+        if not known or len(periods) != ndof // 3 - 1:
             raise Refused("its periods are not those of its planets")
         return {"reach": reach, "n_gradients": gradients, "periods": periods}

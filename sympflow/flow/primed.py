@@ -30,20 +30,11 @@ from sympflow.flow.flow_map import check_system
 from sympflow.flow.frozen import PrimedKnown
 from sympflow.flow.layers import Drift, Kick
 from sympflow.flow.potentials import Time
-from sympflow.flow.primed_potentials import (
-    CURVATURE,
-    FORCE_GRADIENT,
-    POTENTIAL,
-    PolynomialTerm,
-    PrimedDrift,
-    PrimedPotential,
-    Sum,
-    Term,
-)
+from sympflow.flow.primed_potentials import CURVATURE, FORCE_GRADIENT, POTENTIAL, PrimedDrift, PrimedPotential, Term
 from sympflow.flow.records import MAX_LAYERS
 from sympflow.flow.sympflow import SystemFlow
 from sympflow.flow.tables import Columns, Entry, Kind, PrimedShape, Tables, columns_of
-from sympflow.flow.weights import Kept, check_compilable, checked_device, checked_dtype, doubles
+from sympflow.flow.weights import Kept, check_compilable, doubles
 from sympflow.hamiltonian.fingerprint import check_for_flows
 from sympflow.hamiltonian.lattice_states import LatticeStates
 from sympflow.hamiltonian.monomials import Monomials, in_monomials, monomials
@@ -56,37 +47,21 @@ class PrimedFlow(PrimedKnown, SystemFlow):
 
     A palindromic one has even polynomials b, γ, c, a, and its kernel reads the same backwards, which makes K
     time-reversible: continued to negative t by its formulas, K_{−t} = K_t⁻¹. With a processor ψ̄ is conjugate to it.
-    Without a system the flow has a `scheme`, but no values.
-
-    Attributes
-    ----------
-    kicks, drifts, gradients, curvatures : Coefficients, or None
-        b, a, γ and c of the kernel.
-    polynomials : ModuleList of Coefficients, or None
-        e_m, one column for each monomial.
-    processor_kicks, processor_drifts, processor_gradients, processor_curvatures, processor_polynomials
-        Those of χ, or None.
-    substeps : tuple of Substep
-        The maps in the order in which they are executed: χ⁻¹, K, χ.
+    Without a system the flow has a `scheme`, but no values. `kicks`, `drifts`, `gradients` and `curvatures` are the
+    `Coefficients` b, a, γ and c of the kernel, or None, `polynomials` the e_m, and `processor_kicks`, … those of χ;
+    `substeps` are the maps in the order in which they are executed: χ⁻¹, K, χ.
     """
 
     PLAN = "primed"
 
     def __init__(
-        self,
-        ndof: int,
-        shape: PrimedShape,
-        dt: float = 1.0,
-        system: HamiltonianSystem | None = None,
-        dtype: torch.dtype = torch.float64,
-        device: torch.device | str | None = None,
+        self, ndof: int, shape: PrimedShape, dt: float = 1.0, system: HamiltonianSystem | None = None, **like: Any
     ) -> None:
-        super().__init__(ndof, dt)
+        super().__init__(ndof, dt, **like)
         self.shape = shape
-        like: dict[str, Any] = {"dtype": checked_dtype(dtype), "device": checked_device(device)}
 
         def columns(inside: bool) -> Columns:
-            made = shape.columns(inside, lambda name, *given: Coefficients(*given, dt=self.dt, **like))
+            made = shape.columns(inside, lambda name, *given: Coefficients(*given, dt=self.dt, **self._like))
             return made if made.polynomials is None else made._replace(polynomials=nn.ModuleList(made.polynomials))
 
         inside, outside = columns(True), columns(False)
@@ -127,7 +102,10 @@ class PrimedFlow(PrimedKnown, SystemFlow):
             )
         exponents = _monomials_of(system, polynomial, force_gradient, curvature)
         force_gradient = _force_gradient_of(system, False if exponents else force_gradient, curvature)
-        _check_counts(stages, processor)
+        for name, value in (("stages", stages), ("processor", processor)):
+            if isinstance(value, int) and 2 * value + 1 > MAX_LAYERS:
+                most = (MAX_LAYERS - 1) // 2
+                raise ValueError(f"`{name}` must be at most {most}, as many as a file may hold; got {value!r}.")
         scheme = _starting_scheme(system, scheme, stages, first)
         if palindromic and not scheme.symmetric:
             raise ValueError(f"`scheme` {scheme.name!r} is not symmetric: take another, or palindromic=False.")
@@ -152,11 +130,11 @@ class PrimedFlow(PrimedKnown, SystemFlow):
             processor=processor,
             curvature=curvature,
             monomials=exponents,
-            timed=_is_timed(system),
+            timed=not system.keeps_energy,
             gradient_kicks=some,
             curvature_kicks=curved,
         )
-        flow = cls(system.ndof, shape, dt, system, dtype, device)
+        flow = cls(system.ndof, shape, dt, system, dtype=dtype, device=device)
         kicks, drifts = _kicks(scheme), [s for s in substeps if s.kind == "drift"]
         flow.kicks.set_constant([s.one for s in kicks])
         flow.drifts.set_constant([s.one for s in drifts])
@@ -203,12 +181,11 @@ class PrimedFlow(PrimedKnown, SystemFlow):
         substep = self.substeps[i]
         if substep.kind == "drift":
             return PrimedDrift(self.ndof, self._binding, substep.weight)
-        passed = Sum(tuple(s.weight for s in self.substeps[:i] if s.kind == "drift"))
+        passed = [s.weight for s in self.substeps[:i] if s.kind == "drift"]
         terms: list[tuple[Term, Entry]] = [(POTENTIAL, substep.weight)]
-        polynomial = PolynomialTerm(self.monomials, substep.more) if self.monomials else None
-        if polynomial is None:
+        if not self.monomials:
             terms += zip((FORCE_GRADIENT, CURVATURE), substep.more, strict=False)
-        return Kick(PrimedPotential(self.ndof, self._binding, terms, polynomial, passed))
+        return Kick(PrimedPotential(self.ndof, self._binding, terms, self.monomials, substep.more, passed))
 
     # the frozen tables --------------------------------------------------------------------------------------
 
@@ -294,7 +271,7 @@ class PrimedFlow(PrimedKnown, SystemFlow):
                 f"`system` {system.name!r} has no kicks and drifts such as the flow's: it must be H = ½ pᵀM⁻¹p + V(q), "
                 "with `hessian_vector` where V is a function."
             )
-        return self._of(system, replace(self.shape, timed=_is_timed(system)))
+        return self._of(system, replace(self.shape, timed=not system.keeps_energy))
 
     def of_any_size(self, system: HamiltonianSystem) -> Self:
         """Return the flow of a system with the numbers of this one, of a piece of it by its coordinates."""
@@ -306,7 +283,7 @@ class PrimedFlow(PrimedKnown, SystemFlow):
 
     def _of(self, system: HamiltonianSystem, shape: PrimedShape) -> Self:
         """A flow of a system with the numbers of this one."""
-        other = type(self)(system.ndof, shape, self.dt, system, self.dtype, self.device)
+        other = type(self)(system.ndof, shape, self.dt, system, dtype=self.dtype, device=self.device)
         mine = dict(self.columns())
         for name, column in other.columns():
             column.set(to_numpy(mine[name].table))
@@ -348,19 +325,6 @@ class PrimedFlow(PrimedKnown, SystemFlow):
     def initial_velocity(self, x: Tensor, t0: Any = None) -> Tensor:
         """d/dt ψ̄_t(x) at t = 0: that of its system, as the coefficients of V and T sum up to 1."""
         return super().initial_velocity(x, t0) if self.system is None else self.system.vector_field(x, t0)
-
-
-def _is_timed(system: HamiltonianSystem) -> bool:
-    """Return True if the drifts of a kernel must add up to t."""
-    return not system.keeps_energy
-
-
-def _check_counts(stages: Any, processor: Any) -> None:
-    """Raise ValueError where there are more maps than a file may hold."""
-    for name, value in (("stages", stages), ("processor", processor)):
-        if isinstance(value, int) and 2 * value + 1 > MAX_LAYERS:
-            most = (MAX_LAYERS - 1) // 2
-            raise ValueError(f"`{name}` must be at most {most}, as many as a file may hold; got {value!r}.")
 
 
 def _starting_scheme(system: HamiltonianSystem, scheme: Any, stages: Any, first: str) -> Scheme:

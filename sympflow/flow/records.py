@@ -54,39 +54,18 @@ class Refused(Exception):
 
 @dataclass
 class Provenance:
-    """The facts about a flow beside its map: its system, its domain, its figures, and where these hold.
+    """The facts about a flow beside its map: its system, its domain, its figures, and where these hold."""
 
-    Attributes
-    ----------
-    domain : Domain or None
-        Ω, where it was trained.
-    system_name, fingerprint : str or None, tuple of float or None
-        The system it was trained for.
-    recipe, figures : dict
-        How it was trained, and what it achieved.
-    certified : Certificate or None
-        What `certificate` found, or the file held that the flow was loaded from.
-    identity : Identity or None
-        H of that system, all over Ω; None for a flow without a system, or from a file that was written before.
-    unfitted : tuple of (float, float)
-        Open intervals of t in which it was never compared with anything: those between the times of labels, if these
-        were few and it was fitted to nothing else. Results there come with a warning.
-    drive_times : (float, float) or None
-        The interval of t0 + t that the flow of a drive without a period was fitted in: beyond it there is a warning.
-    lattice_terms : mapping of str to str
-        The terms of a lattice, for messages; {} of another system.
-    """
-
-    domain: Domain | None = None
-    system_name: str | None = None
+    domain: Domain | None = None  # Ω, where it was trained
+    system_name: str | None = None  # of the system it was trained for
     fingerprint: tuple[float, ...] | None = None
-    recipe: dict[str, Any] = field(default_factory=dict)
-    figures: dict[str, Any] = field(default_factory=dict)
-    certified: Certificate | None = None
-    identity: Identity | None = None
-    unfitted: tuple[tuple[float, float], ...] = ()
-    drive_times: tuple[float, float] | None = None
-    lattice_terms: Mapping[str, str] = field(default_factory=dict)
+    recipe: dict[str, Any] = field(default_factory=dict)  # how it was trained
+    figures: dict[str, Any] = field(default_factory=dict)  # and what it achieved
+    certified: Certificate | None = None  # what `certificate` found, or the file held that it was loaded from
+    identity: Identity | None = None  # H of that system, all over Ω; None without a system, or from an early file
+    unfitted: tuple[tuple[float, float], ...] = ()  # open intervals of t in which it was compared with nothing
+    drive_times: tuple[float, float] | None = None  # t0 + t for which a drive without a period was fitted
+    lattice_terms: Mapping[str, str] = field(default_factory=dict)  # of a lattice, for messages
 
     def to_record(self) -> dict[str, Any]:
         """The entries of the record in a file, without those that say nothing; the certificate is not among them."""
@@ -119,7 +98,11 @@ class Provenance:
         for name, value in record["figures"].items():
             if value is not None and not _is_number(value):
                 raise Refused(f"its figures have a {name} that is neither a number nor None: {value!r}")
-        certificate, identity = _certificate(record), _identity(record, ndof)
+        identity, certificate = _identity(record, ndof), None
+        if record.get("certificate") is not None:
+            certificate = _made("certificate", Certificate.from_dict, record["certificate"])
+            if certificate.weights != record.get("checksum"):
+                raise Refused("its certificate is one of other weights")
         domain = None if record["domain"] is None else _domain(record["domain"], ndof)
         if fingerprint is not None:
             fingerprint = tuple(math.nan if v is None else float(v) for v in fingerprint)
@@ -127,6 +110,9 @@ class Provenance:
         driven = _intervals(record.get("drive_times", []), "times of its drive")
         if len(driven) > 1 or any(low >= high for low, high in driven):
             raise Refused("its times of the drive are not one interval")
+        texts = record.get("lattice_terms", {})  # which are shown and never read
+        if not isinstance(texts, dict) or not all(isinstance(text, str) for text in texts.values()):
+            raise Refused("its terms of a lattice are not a table of texts")
         return cls(
             domain,
             system,
@@ -137,7 +123,7 @@ class Provenance:
             identity,
             unfitted,
             driven[0] if driven else None,
-            _texts(record.get("lattice_terms", {})),
+            texts,
         )
 
 
@@ -260,16 +246,6 @@ def _made(what: str, make: Callable[..., T], *given: Any) -> T:
         raise Refused(f"its {what} is not admissible ({error})") from None
 
 
-def _certificate(record: dict[str, Any]) -> Certificate | None:
-    """Return the certificate in the record, if there is one; it must be of the weights that the file holds."""
-    if record.get("certificate") is None:
-        return None
-    certificate = _made("certificate", Certificate.from_dict, record["certificate"])
-    if certificate.weights != record.get("checksum"):
-        raise Refused("its certificate is one of other weights")
-    return certificate
-
-
 def _identity(record: dict[str, Any], ndof: int) -> Identity | None:
     """Return the identity of the system in the record, if there is one; a text in it is not read yet."""
     kept = record.get("identity")
@@ -283,13 +259,6 @@ def _intervals(pairs: Any, what: str) -> tuple[tuple[float, float], ...]:
     if not all(_is_number(v) for pair in pairs for v in pair):
         raise Refused(f"its {what} are not numbers")
     return tuple((float(low), float(high)) for low, high in pairs)
-
-
-def _texts(table: Any) -> dict[str, str]:
-    """Return a table of texts in a record, which are shown and never read; else it is refused."""
-    if not isinstance(table, dict) or not all(isinstance(text, str) for text in table.values()):
-        raise Refused("its terms of a lattice are not a table of texts")
-    return table
 
 
 def _check_system(name: Any, fingerprint: Any, ndof: int) -> None:

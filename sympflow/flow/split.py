@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sympflow.arguments import check_flag, plain
+from sympflow.arguments import check_counts, check_flag, plain
 from sympflow.flow.coefficients import Column
 from sympflow.flow.flow_map import check_system
 from sympflow.flow.layers import OwnLayer
@@ -26,7 +26,7 @@ from sympflow.flow.potentials import Time, by_time
 from sympflow.flow.records import MAX_DEGREE, MAX_LAYERS, MAX_PARAMETERS, Refused, checked_integer
 from sympflow.flow.sympflow import SystemFlow
 from sympflow.flow.tables import Memory, Total
-from sympflow.flow.weights import Kept, check_compilable, checked_device, checked_dtype, doubles
+from sympflow.flow.weights import Kept, doubles
 from sympflow.hamiltonian.expression import Unreadable, read
 from sympflow.hamiltonian.fingerprint import check_for_flows
 from sympflow.hamiltonian.parts import LINEAR, ExactParts, SubFlow, exact_parts, map_evaluations
@@ -42,16 +42,12 @@ FILTERED = ("oscillator", "hyperbolic")
 
 
 class KeptMaps(Memory):
-    """The maps of fixed numbers, the same objects for the same step, and what they cost; `placement` is asked once."""
+    """The maps of fixed numbers, the same objects for the same step, and what they cost."""
 
-    def __init__(
-        self, make: Callable[[np.ndarray], list[SubFlow]], coefficients: list[SubFlow], dt: float, like: Tensor
-    ) -> None:
+    def __init__(self, make: Callable[[np.ndarray], list[SubFlow]], coefficients: list[SubFlow], dt: float) -> None:
         super().__init__(MOST_KEPT)
         self._make, self._dt = make, dt
-        self.kernel: SplitFlowKernel | None = None  # the compiled loops that were made of these last
         self._coefficients = coefficients, [m.inverse() for m in reversed(coefficients)]
-        self.placement = like.dtype, like.device
 
     def maps(self, t: float) -> list[SubFlow]:
         return self.kept(t, lambda: self._make(np.array(t)))
@@ -70,14 +66,11 @@ class SplitLayer(OwnLayer):
 
     def __init__(self, flow: SplitFlow, index: int) -> None:
         super().__init__(flow)
-        self.index, self.part = index, flow.sequence[index]
-        self.kind = "linear" if self.part == LINEAR else flow.kinds[self.part - 1]  # type: ignore[misc]
+        self.index = index
 
-    def forward(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
-        return self._apply_map(self.flow.maps(t)[self.index], q, p)
-
-    def inverse(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
-        return self._apply_map(self.flow.maps(t)[self.index].inverse(), q, p)
+    def moved(self, t: Time, y: Tensor, back: bool) -> Tensor:
+        m, parts = self.flow.maps(t)[self.index], self.flow.parts
+        return parts.from_modes(*parts.apply([m.inverse() if back else m], *parts.to_modes(y)))
 
     def pull_back(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         q, p = self.inverse(t, q, p)
@@ -95,14 +88,6 @@ class SplitLayer(OwnLayer):
             return V
 
         return q, p, by_time(generator, q)[1]
-
-    def _apply_map(self, m: SubFlow, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
-        parts = self.flow.parts
-        y = parts.from_modes(*parts.apply([m], *parts.to_modes(torch.cat([q, p]).T))).T
-        return y.chunk(2)
-
-    def to_dict(self) -> dict[str, Any]:
-        return {"kind": self.kind, "part": self.part}
 
 
 class SplitFlow(SystemFlow):
@@ -128,38 +113,35 @@ class SplitFlow(SystemFlow):
         dt: float = 1.0,
         expressions: Sequence[str] | None = None,
         system: HamiltonianSystem | None = None,
-        dtype: torch.dtype = torch.float64,
-        device: torch.device | str | None = None,
+        **like: Any,
     ) -> None:
-        super().__init__(ndof, dt)
+        super().__init__(ndof, dt, **like)
         self.expressions = None if expressions is None else tuple(expressions)
         self.sequence, self.kinds, self.classes = tuple(sequence), tuple(kinds), tuple(classes)
         if not self.sequence or self.sequence != self.sequence[::-1]:
             raise ValueError("`sequence` must read the same backwards: make it a palindrome.")
         if set(self.sequence) - set(range(len(self.kinds) + 1)):
             raise ValueError(f"`sequence` names parts beyond the {len(self.kinds)} there are: check `kinds`.")
-        if isinstance(terms, bool) or not isinstance(terms, int) or terms < 1:
-            raise ValueError(f"`terms` must be a positive integer; got {terms!r}.")
+        check_counts(terms=terms)
         self.terms, self.filtered, self.gradient_kicks = terms, bool(filters), tuple(sorted(set(gradients)))
         n_kicks = self.sequence.count(1)
         if self.gradient_kicks != tuple(sorted(n_kicks - 1 - i for i in self.gradient_kicks)):
             raise ValueError(f"`force_gradient` {gradients!r} is not the same from either end of {n_kicks} kicks.")
         if not set(self.gradient_kicks) <= set(range(n_kicks)) or (gradients and "shear" in self.kinds):
             raise ValueError(f"`force_gradient` {gradients!r} names no kicks: count them from 0 to {n_kicks - 1}.")
-        like: dict[str, Any] = {"dt": self.dt, "dtype": checked_dtype(dtype), "device": checked_device(device)}
 
-        def column(part: int, power: int, total: Total) -> Column:
-            return Column(self.sequence.count(part), range(terms), power, total=total, **like)
+        def column(n: int, power: int, total: Total = None) -> Column:
+            return Column(n, range(terms), power, total=total, dt=self.dt, **self._like)
 
         modules = torch.nn.ModuleList
         rest = [k for k in range(1, len(self.kinds) + 1) if k in self.sequence]
         turning = [f for f, kind in enumerate(self.classes) if kind in FILTERED]
         linear = range(len(self.classes)) if LINEAR in self.sequence else ()
-        self.linear = modules(column(LINEAR, 1, "always") for _ in linear)
-        self.weights = modules(column(k, 1, "start") for k in rest)
-        self.filters = modules(column(k, 0, None) for k in rest for _ in turning if filters)
-        n_gradients = len(self.gradient_kicks)
-        self.gradients = modules(Column(n_gradients, range(terms), 3, **like) for _ in range(n_gradients > 0))
+        count = self.sequence.count
+        self.linear = modules(column(count(LINEAR), 1, "always") for _ in linear)
+        self.weights = modules(column(count(k), 1, "start") for k in rest)
+        self.filters = modules(column(count(k), 0) for k in rest for _ in turning if filters)
+        self.gradients = modules(column(len(self.gradient_kicks), 3) for _ in range(bool(self.gradient_kicks)))
         self._slot = {k: i for i, k in enumerate(rest)}
         self._turning = turning
         for c in self.columns():  # equal steps, φ = 1
@@ -221,18 +203,12 @@ class SplitFlow(SystemFlow):
             t = t.to(self.dtype)
         return self._assemble(lambda column: column.values(t), lambda entries: torch.stack(entries, dim=-1))
 
-    def numpy_maps(self, t: np.ndarray) -> list[SubFlow]:
-        """The same of an array of times, for the compiled loops; for t < 0 the inverse of ψ̄_|t| (one sign for all)."""
-        t = np.asarray(t, dtype=float)
-        return self.frozen().maps(float(t)) if t.ndim == 0 else self._numpy_maps(t)
-
     def frozen(self) -> KeptMaps:
         """Return the maps of the numbers that the flow has now."""
-        return self._maps.current(
-            lambda: KeptMaps(self._numpy_maps, self._coefficient_maps(), self.dt, self._maps.first())
-        )
+        return self._maps.current(lambda: KeptMaps(self._numpy_maps, self._coefficient_maps(), self.dt))
 
     def _numpy_maps(self, t: np.ndarray) -> list[SubFlow]:
+        """The same of an array of times, for the compiled loops; for t < 0 the inverse of ψ̄_|t| (one sign for all)."""
         maps = self._assemble(
             lambda column: np.moveaxis(column.at(np.abs(t)), -1, 0), lambda entries: np.stack(entries, axis=-1)
         )
@@ -241,9 +217,7 @@ class SplitFlow(SystemFlow):
     def _coefficient_maps(self) -> list[SubFlow]:
         """The maps with the coefficients of the columns, (K, …), in place of their values."""
         return self._assemble(
-            lambda column: doubles(column.table),
-            lambda entries: np.stack(entries, axis=-1),
-            np.eye(1, self.terms)[0],
+            lambda column: doubles(column.table), lambda entries: np.stack(entries, axis=-1), np.eye(1, self.terms)[0]
         )
 
     def _assemble(self, values: Any, stack: Any, unity: Any = None) -> list[SubFlow]:
@@ -281,15 +255,10 @@ class SplitFlow(SystemFlow):
         parts = self.parts
         return parts.from_modes(*parts.apply(maps, *parts.to_modes(y.T))).T
 
-    def _loops_for(self, system: HamiltonianSystem) -> SplitFlowKernel:
-        flow = self.bound(system)
-        frozen = flow.frozen()
-        if frozen.kernel is None or frozen.kernel.parts is not flow.parts:
-            from sympflow.flow.loops import SplitFlowKernel
+    def _compiled_for(self, system: HamiltonianSystem, compensated: bool) -> SplitFlowKernel:
+        from sympflow.flow.loops import SplitFlowKernel
 
-            check_compilable(*frozen.placement)
-            frozen.kernel = SplitFlowKernel(frozen, flow.parts, flow.dt)
-        return frozen.kernel
+        return SplitFlowKernel(self.frozen(), self.parts, self.dt)
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
         return self.frozen().evaluations(n_steps, n_saved, n_extra, backend)

@@ -14,9 +14,10 @@ from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
 from sympflow.arguments import plain, real_number
+from sympflow.compiler import NotCompiled
 from sympflow.flow.families import family
 from sympflow.flow.flow_map import FlowMap
-from sympflow.flow.layers import LAYERS, Binding, Drift, Kick, Layer
+from sympflow.flow.layers import LAYERS, Binding, Drift, Kick, Layer, PotentialLayer
 from sympflow.flow.potentials import (
     MLPPotential,
     Potential,
@@ -28,7 +29,7 @@ from sympflow.flow.potentials import (
 )
 from sympflow.flow.records import MAX_DEGREE, MAX_LAYERS, MAX_PARAMETERS, Refused, checked_widths, count_parameters
 from sympflow.flow.scaling import Scaling
-from sympflow.flow.weights import Kept, check_compilable, check_memory
+from sympflow.flow.weights import Kept, check_compilable, check_memory, checked_device, checked_dtype
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.protocol import Kernel
 from sympflow.schemes import Scheme
@@ -538,27 +539,48 @@ class SympFlow(FlowMap):
                 _check_storable(layer)
         super().save(path)
 
-    def _loops_for(self, system: HamiltonianSystem) -> Kernel:
+    @property
+    def _kept_kernels(self) -> Kept[Any]:
+        """The compiled loops of the numbers that the flow has now."""
         if self._network is None:
-            self._network = Kept(d for m in self.modules() for d in (m._parameters, m._buffers))
-        return self._network.current(self._compiled)
+            self._network = Kept(self._kept_tensors())
+        return self._network
+
+    def _kept_tensors(self) -> Iterable[Mapping[str, Tensor | None]]:
+        """The tensors that compiled loops are made of, which they are compared with in every run."""
+        return (d for m in self.modules() for d in (m._parameters, m._buffers))
+
+    def _loops_for(self, system: HamiltonianSystem) -> Kernel:
+        return self._kept_kernels.current(self._compiled)
 
     def _compiled(self) -> MLPFlowKernel:
         from sympflow.kernels.networks import MLPFlowKernel
 
-        networks = [layer.network() for layer in self.layers]  # type: ignore[operator]
+        if not (potentials := self._potentials()):
+            raise NotCompiled("`flow` has layers other than kicks and drifts with MLP potentials: use backend='array'.")
+        networks = [V.network(is_kick) for is_kick, V in potentials]
         check_compilable(self.dtype, self.device)
         return MLPFlowKernel(self.ndof, networks)
 
     def tangents(self) -> NetworkTangents | None:
         from sympflow.kernels.network_tangents import NetworkTangents
 
-        networks = [layer.trained() for layer in self.layers]  # type: ignore[operator]
-        if None in networks or len({(n.inputs, n.widths, n.activation) for n in networks}) > 1:
+        potentials = self._potentials()
+        networks = [network for _, V in potentials if (network := V.trained()) is not None]
+        alike = len({(n.inputs, n.widths, n.activation) for n in networks}) == 1
+        if not alike or len(networks) < len(potentials):
             return None
-        return NetworkTangents(self.ndof, [layer.kind == "kick" for layer in self.layers], networks)
+        return NetworkTangents(self.ndof, [is_kick for is_kick, _ in potentials], networks)
+
+    def _potentials(self) -> list[tuple[bool, MLPPotential]]:
+        """The potentials of its kicks, with True, and drifts; none where a layer is of another kind."""
+        layers: list[Any] = list(self.layers)
+        if not all(isinstance(x, PotentialLayer) and isinstance(x.potential, MLPPotential) for x in layers):
+            return []
+        return [(layer.kind == "kick", layer.potential) for layer in layers]
 
     def step_constants(self, x: Tensor, *t0: Tensor) -> Tensor:
+        """The constants of a step from states (N, 2d) that its networks take beside these and t: (m, N)."""
         return self._opened(self._columns(0.0, self.lift(x, *t0))[1], 0.0)[0][self.ndof :]
 
     def hamiltonian_unchecked(self, t: float | Tensor, x: Tensor, t0: Any = None) -> Tensor:
@@ -612,13 +634,10 @@ class SystemFlow(SympFlow):
     """The name of its plan in a file, which `plan` tells, and `checked_plan` makes arguments of."""
     MADE: ClassVar[str] = "primed with the V and T of a system"
 
-    def __init__(self, ndof: int, dt: float) -> None:
+    def __init__(self, ndof: int, dt: float, dtype: Any = torch.float64, device: Any = None) -> None:
         super().__init__(ndof, dt=dt, layers=())
+        self._like: dict[str, Any] = {"dtype": checked_dtype(dtype), "device": checked_device(device)}
         self._binding = Binding(None, self.MADE)
-        self._loops: tuple[HamiltonianSystem, Any] | None = None  # compiled, of the system that was asked for last
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {**vars(self), "_loops": None}  # copies and pickles make their own
 
     def plan(self) -> dict[str, Any]:
         """The numbers that describe the flow, JSON-able."""
@@ -664,13 +683,18 @@ class SystemFlow(SympFlow):
     def bound(self, system: HamiltonianSystem) -> Self:
         return self if self._binding.known else self.bind(system)
 
-    def _loops_for(self, system: HamiltonianSystem) -> Kernel:
-        check_compilable(self.dtype, self.device)
-        if self._loops is None or self._loops[0] is not system:
-            self._loops = system, self._compiled_for(system)
-        return self._loops[1]
+    def _kept_tensors(self) -> Iterable[Mapping[str, Tensor | None]]:
+        return (self._buffers, *(m._parameters for m in self.modules()))  # the bases of columns are no numbers
 
-    def _compiled_for(self, system: HamiltonianSystem) -> Kernel:
+    def _loops_for(self, system: HamiltonianSystem, compensated: bool = False) -> Kernel:
+        flow = self.bound(system)
+        kernels = flow._kept_kernels.current(dict)
+        if compensated not in kernels or kernels[compensated][0] is not system:
+            check_compilable(flow.dtype, flow.device)
+            kernels[compensated] = system, flow._compiled_for(system, compensated)
+        return kernels[compensated][1]
+
+    def _compiled_for(self, system: HamiltonianSystem, compensated: bool) -> Kernel:
         """The compiled loops of the flow on a system."""
         raise NotImplementedError
 

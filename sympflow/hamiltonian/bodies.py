@@ -43,15 +43,7 @@ class PairsHamiltonian(LocalHamiltonian):
     quadratic_kinetic = True
 
     def __init__(
-        self,
-        potential: str | sp.Expr,
-        masses: Any,
-        dim: Any,
-        box: Any,
-        cutoff: Any,
-        softening: Any,
-        params: Mapping[str, Any] | None,
-        bodies: Mapping[str, Any] | None,
+        self, potential: Any, masses: Any, dim: Any, box: Any, cutoff: Any, softening: Any, params: Any, bodies: Any
     ) -> None:
         self.dim = checked_count("dim", plain(dim), 1, MOST_AXES, "1, 2 or 3, the coordinates of a body")
         self.masses = checked_column("masses", masses)
@@ -186,12 +178,7 @@ class PairsHamiltonian(LocalHamiltonian):
         return SymbolicHamiltonian(T + V, {f"{name}_": value for name, value in self.params.items()})
 
     def written_potential(
-        self,
-        q: Sequence[sp.Expr],
-        softening: sp.Expr,
-        columns: Sequence[Sequence[sp.Expr]],
-        c: Mapping[sp.Symbol, sp.Expr],
-        box: Sequence[sp.Expr] = (),
+        self, q: Sequence[Any], softening: Any, columns: Sequence[Any], c: Mapping[Any, Any], box: Sequence[Any] = ()
     ) -> sp.Expr:
         """V of all pairs, in symbols of positions, ε², columns of bodies, parameters and the sides of the box."""
         terms = []
@@ -211,11 +198,11 @@ class PairsHamiltonian(LocalHamiltonian):
     # a few of many ----------------------------------------------------------------------------------------------------
 
     @property
-    def uniform(self) -> bool:
+    def uniform(self) -> bool:  # type: ignore[override]
         return all((x == x[0]).all() for x in (self.masses, *self.columns))
 
     @property
-    def apart(self) -> float:
+    def apart(self) -> float:  # type: ignore[override]
         """A power of two near six bonds: bodies nearer than one repel each other, beside which all else is rounding."""
         return (
             1.0 if self.box is not None or self.bond_length is None else 2.0 ** round(math.log2(6 * self.bond_length))
@@ -296,7 +283,7 @@ class PairsHamiltonian(LocalHamiltonian):
         return self.box is None and not self.softening
 
     @cached_property
-    def poles(self) -> Poles | None:  # type: ignore[override]
+    def poles(self) -> Poles | None:
         return PairsPoles(self) or None
 
     def met(self, y: np.ndarray, together: bool = False) -> Iterator[tuple[Any, Any, np.ndarray, list[Any]]]:
@@ -313,7 +300,8 @@ class PairsHamiltonian(LocalHamiltonian):
         for pairs in self._pairs(q, p / np.repeat(self.inertia, self.dim)):
             x, w = pairs.x
             r, side = np.sqrt(pairs.s), np.sign(x @ ASLANT[: self.dim])
-            straight = _is_straight(x, w)
+            speed, across = _dot(w, w), w - (_dot(x, w) / np.maximum(_dot(x, x), TINY))[..., None] * x
+            straight = (speed > 0) & (_dot(across, across) <= STRAIGHT**2 * speed)
             along = straight.all(0, keepdims=True) if together else straight
             yield pairs.i, pairs.j, np.where(along, side, 1.0) * r, pairs.symbol_values
 
@@ -495,12 +483,6 @@ def _incidence(n: int) -> np.ndarray:
     """1 at the first and −1 at the second end of each pair of n bodies: (P, n)."""
     i, j = np.triu_indices(n, 1)
     return np.eye(n)[i] - np.eye(n)[j]
-
-
-def _is_straight(x: np.ndarray, w: np.ndarray) -> np.ndarray:
-    """True where velocities w (..., dim) are along differences x of places."""
-    speed, across = _dot(w, w), w - (_dot(x, w) / np.maximum(_dot(x, x), TINY))[..., None] * x
-    return (speed > 0) & (_dot(across, across) <= STRAIGHT**2 * speed)
 
 
 def _dot(x: Array, y: Array) -> Array:

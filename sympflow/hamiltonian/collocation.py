@@ -57,10 +57,7 @@ def advanced(system: HamiltonianSystem, tableau: Tableau, y: Array, K: Array, h:
 
 
 def stages(system: HamiltonianSystem, tableau: Tableau, y: Array, h: Any, times: Any) -> tuple[Array, int]:
-    """The K (..., s, 2d) of a step, NaN where the step was not solved; and the iterations, over all states.
-
-    Of tensors they are solved without a graph, then by three more iterations in it, which give them derivatives.
-    """
+    """The K (..., s, 2d) of a step, NaN where the step was not solved; and the iterations, over all states."""
     A, _, scale = (like(c, y) for c in tableau)
     if not is_tensor(y):
         with np.errstate(all="ignore"):
@@ -144,12 +141,10 @@ def newton_matrix(
         p = system.friction.drift(Y[..., d:], tau[..., None])[1]
         Y = concatenate([Y[..., :d], p])
     S = system.hessian(Y, times)
-    D = concatenate([S[..., d:, :].swapaxes(-1, -2), -S[..., :d, :].swapaxes(-1, -2)]).swapaxes(-1, -2)
+    D = concatenate([S[..., d:, :], -S[..., :d, :]], -2)
     if tau is not None:
-        by_P, grown = D[..., d:] @ decays(system, tau), decays(system, -tau)
-        D = concatenate([D[..., :d], by_P])
-        lower = grown @ D[..., d:, :]
-        D = concatenate([D[..., :d, :].swapaxes(-1, -2), lower.swapaxes(-1, -2)]).swapaxes(-1, -2)
+        D = concatenate([D[..., :d], D[..., d:] @ decays(system, tau)])
+        D = concatenate([D[..., :d, :], decays(system, -tau) @ D[..., d:, :]], -2)
     outer = h[..., None, None, None] if getattr(h, "ndim", 0) else h
     blocks = outer * (scale[:, None] * A)[:, None, :, None] * D[..., :, :, None, :]
     M = -blocks.reshape(*Y.shape[:-2], s * n, s * n)

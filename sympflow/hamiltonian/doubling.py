@@ -8,12 +8,6 @@ the mean of the copies and their difference, q₊, p₊ and q₋, p₋, it is
 with positions (q₊, q₋) and momenta (p₋, p₊), in this order: the partner of q₊ is p₋. These are H(1) − H(2) − K of the
 copies with K = q₋·F, to first order in the difference, which is all that the physical limit q₋ = p₋ = 0 keeps. There
 (q₊, p₊) moves as above, and the difference stays 0.
-
-References
-----------
-.. [1] C. R. Galley, "Classical mechanics of nonconservative systems", Phys. Rev. Lett. 110 (2013) 174301, eqs. (5)–(9).
-.. [2] D. Tsang, C. R. Galley, L. C. Stein, A. Turner, "'Slimplectic' integrators: variational integrators for general
-   nonconservative systems", Astrophys. J. Lett. 809 (2015) L9.
 """
 
 from __future__ import annotations
@@ -25,27 +19,19 @@ from typing import Any
 import numpy as np
 
 from sympflow.arguments import warn
-from sympflow.arrays import Array, concatenate, is_tensor, of_library
+from sympflow.arrays import Array, as_tensor, concatenate, is_tensor, jacobian, of_library
 from sympflow.hamiltonian.domain import Box, Domain
-from sympflow.hamiltonian.hamiltonian import ExternalForce
 from sympflow.hamiltonian.system import HamiltonianSystem
 
 Force = Callable[[Array, Array], Array]
-
 THIN = 0.1  # width of the default domain in q₋ and p₋, over that in q and p
 _DRAWN = 1000  # states that find the extent of a domain
 
 
 class DoubledSystem(HamiltonianSystem):
-    """A Hamiltonian system in twice the variables whose physical limit has friction and any other force.
+    """A Hamiltonian system in twice the variables whose physical limit has friction and any other force: see `doubled`.
 
-    `doubled` makes it, and documents it.
-
-    Attributes
-    ----------
-    physical : HamiltonianSystem
-        The system of the physical limit, of d degrees of freedom: that which was doubled, with F as its
-        `external_force`. Runge–Kutta methods and `solve_ivp` integrate it as it is; all others take the doubled one.
+    `physical` is the system of the limit, with F as its `external_force`, which Runge–Kutta methods integrate as it is.
     """
 
     _continuous = False
@@ -56,13 +42,7 @@ class DoubledSystem(HamiltonianSystem):
         return self
 
     def lift(self, y: Array) -> Array:
-        """[q, 0, 0, p], the state for a physical state y = [q, p]: (..., 2d) to (..., 4d).
-
-        Raises
-        ------
-        ValueError
-            If y has another width.
-        """
+        """[q, 0, 0, p], the state for a physical state y = [q, p]: (..., 2d) to (..., 4d)."""
         d = self.ndof // 2
         if y.ndim == 0 or y.shape[-1] != 2 * d:
             raise ValueError(
@@ -170,10 +150,10 @@ def doubled(
                 f"`force` is given by symbols, but `system` {system.name!r} by functions: give it as a function "
                 "F(q, p), written with torch."
             )
-        F: ExternalForce = GivenForce(force if given else lambda q, p: 0 * p)
+        F: Any = GivenForce(force if given else lambda q, p: 0 * p)
         made = DoubledSystem(hamiltonian=_DoubledFunctions(system, F), ndof=2 * system.ndof, check=False, **scene)
     else:
-        from sympflow.hamiltonian.forces import SymbolicForce, doubled_hamiltonian
+        from sympflow.hamiltonian.symbolic import SymbolicForce, doubled_hamiltonian
 
         F = SymbolicForce(system, [0] * system.ndof if force is None else force, params)
         if system.conservative and F.has_potential:
@@ -189,7 +169,7 @@ def doubled(
 
 
 class GivenForce:
-    """F(q, p) of a user, written with torch functions: see `ExternalForce`."""
+    """F(q, p) of a user, written with torch functions."""
 
     expressions: Sequence[Any] = ()
 
@@ -209,24 +189,14 @@ class GivenForce:
         return of_library(value, p)
 
     def jacobian(self, q: Array, p: Array, *t: Any) -> Array:
-        import torch
-
-        from sympflow.arrays import jvp
-
-        d, x = p.shape[-1], torch.as_tensor(concatenate([q, p]))
-        columns = []
-        for i in range(2 * d):
-            along = torch.zeros_like(x)
-            along[..., i] = 1
-            columns.append(jvp(lambda z: self(z[..., :d], z[..., d:]), x, along)[1])
-        found = torch.stack(columns, dim=-1)
-        return of_library(found, p)
+        d, x = p.shape[-1], as_tensor(concatenate([q, p]))
+        return of_library(jacobian(lambda z: self(z[..., :d], z[..., d:]), x)[1], p)
 
 
 class _DoubledFunctions:
     """A of a system that is given by functions, or has a force that is."""
 
-    def __init__(self, system: HamiltonianSystem, force: ExternalForce) -> None:
+    def __init__(self, system: HamiltonianSystem, force: Any) -> None:
         self.system, self.force = system, force
 
     def __call__(self, Q: Array, P: Array) -> Array:

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Self
-from weakref import WeakKeyDictionary, ref
 
 import numpy as np
 
 from sympflow.arrays import to_numpy
 from sympflow.hamiltonian.domain import Domain, domain_of
+from sympflow.lazy import lately_kept
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.hamiltonian import Hamiltonian
@@ -90,9 +90,6 @@ def without_friction(mine: Sequence[float], identity: Identity | None, system: H
     return bool(system.friction) and recognised(mine, identity, system, friction=False)
 
 
-Known = WeakKeyDictionary["Hamiltonian", bool]
-
-
 @dataclass(eq=False)
 class Identity:
     """The H of a system as a flow keeps it, to know it again all over its domain, and along a run."""
@@ -100,13 +97,6 @@ class Identity:
     states: np.ndarray
     energies: np.ndarray
     expression: str | None
-    _agreed: Known = field(default_factory=WeakKeyDictionary, init=False, repr=False)
-    _proved: Known = field(default_factory=WeakKeyDictionary, init=False, repr=False)
-    _last: ref[Hamiltonian] | None = field(default=None, init=False, repr=False)
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        """Everything but what was found out about systems."""
-        return Identity, (self.states, self.energies, self.expression)
 
     @classmethod
     def of(cls, system: Hamiltonian, domain: Domain | None, seed: int = 20260103) -> Self:
@@ -120,12 +110,7 @@ class Identity:
 
     def agrees(self, system: Hamiltonian) -> bool:
         """Return True if H of a system has these energies at these states, up to a constant; found out once."""
-        if self._last is not None and self._last() is system:  # in nearly all calls
-            return True
-        found = self._agreed.get(system)
-        if found is None:
-            found = self._agreed[system] = self.is_proved(system) or self.first_difference(system) is None
-        return found
+        return _agrees(system, self)
 
     def first_difference(self, system: Hamiltonian, states: np.ndarray | None = None) -> int | None:
         """The index of the first of the states (n, 2d), by default its own, where H differs from a system's."""
@@ -157,34 +142,11 @@ class Identity:
             i = int(finite[0]) if finite.size else 0
             return float(_energies(system, self.states[: i + 1])[i]), float(self.energies[i])
         read, state = _read(self.expression, system.ndof), _fixed_states(system.ndof)[:1]
-        assert read is not None
         return float(_energies(system, state)[0]), float(_energies(read, state)[0])
 
     def is_proved(self, system: Hamiltonian) -> bool:
         """Return True if the formula of a system is this one, up to a constant; found out once."""
-        if self._last is not None and self._last() is system:
-            return True
-        found = self._proved.get(system)
-        if found is None:
-            found = self._proved[system] = self._prove(system)
-        if found:
-            self._last = ref(system)
-        return found
-
-    def _prove(self, system: Hamiltonian) -> bool:
-        mine, theirs = self.expression, system.expression
-        if mine is None or theirs is None:
-            return False
-        if mine == theirs:
-            return True
-        if len(mine) + len(theirs) > LONGEST_COMPARED:
-            return False
-        import sympy
-
-        read, given = _read(mine, system.ndof), system.symbols
-        if read is None or read.symbols is None or given is None:
-            return False
-        return bool(sympy.expand(read.symbols.H - given.H).is_number)
+        return _is_proved(system, self.expression)
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-able."""
@@ -206,6 +168,26 @@ class Identity:
         return cls(states, energies, expression)
 
 
+@lately_kept
+def _agrees(system: Hamiltonian, identity: Identity) -> bool:
+    return identity.is_proved(system) or identity.first_difference(system) is None
+
+
+@lately_kept
+def _is_proved(system: Hamiltonian, mine: str | None) -> bool:
+    theirs = system.expression
+    if mine is None or theirs is None or mine == theirs:
+        return mine is not None and mine == theirs
+    if len(mine) + len(theirs) > LONGEST_COMPARED:
+        return False
+    import sympy
+
+    read, given = _read(mine, system.ndof), system.symbols
+    if read is None or read.symbols is None or given is None:
+        return False
+    return bool(sympy.expand(read.symbols.H - given.H).is_number)
+
+
 def _floats(values: Any, ndim: int) -> np.ndarray:
     """A list of numbers or None, or for ndim = 2 a list of such lists, as an array."""
     rows = values if ndim == 2 else [values]
@@ -220,21 +202,16 @@ def _floats(values: Any, ndim: int) -> np.ndarray:
         raise ValueError("its numbers are no array of floats") from None
 
 
-def _probed_times(system: Hamiltonian, n: int) -> np.ndarray:
-    """The times (n,) of states, within the samples of a function of t if there are some."""
-    span = None if system.symbols is None else system.symbols.span
-    low, high = (0.0, LATEST) if span is None else span
-    return low + (high - low) * (np.arange(1, n + 1) * GOLDEN % 1.0)
-
-
 def _energies(system: Hamiltonian, states: np.ndarray) -> np.ndarray:
-    """H at the states (n, 2d), of a driven system each at a time that its number gives."""
+    """H at the states (n, 2d), of a driven system each at a time that its number gives, within samples."""
+    low, high = (system.symbols and system.symbols.span) or (0.0, LATEST)
+    times = low + (high - low) * (np.arange(1, len(states) + 1) * GOLDEN % 1.0)
     with np.errstate(all="ignore"):
-        return to_numpy(system.hamiltonian(states, _probed_times(system, len(states)))).astype(float)
+        return to_numpy(system.hamiltonian(states, times)).astype(float)
 
 
 @lru_cache(maxsize=16)
-def _read(expression: str | None, ndof: int) -> Hamiltonian | None:
+def _read(expression: str | None, ndof: int) -> Any:
     """The H of a text in a file, read by a grammar and never executed; None if it is none of d degrees of freedom."""
     from sympflow.hamiltonian.hamiltonian import Hamiltonian
     from sympflow.hamiltonian.symbolic import SymbolicHamiltonian

@@ -40,14 +40,7 @@ class LatticeHamiltonian(LocalHamiltonian):
     loops = noun = "lattice"
 
     def __init__(
-        self,
-        onsite: str | sp.Expr | None,
-        bond: str | sp.Expr | Mapping[int, str | sp.Expr] | None,
-        shape: Any,
-        boundary: Any,
-        kinetic: str | sp.Expr | None,
-        fields: Any,
-        params: Mapping[str, Any] | None,
+        self, onsite: Any, bond: Any, shape: Any, boundary: Any, kinetic: Any, fields: Any, params: Any
     ) -> None:
         self.shape = checked_shape(shape)
         self.boundary = _checked_boundary(boundary, len(self.shape))
@@ -113,7 +106,7 @@ class LatticeHamiltonian(LocalHamiltonian):
         return (max(FEW[len(self.shape) - 1], least),) * len(self.shape)
 
     @property
-    def uniform(self) -> bool:
+    def uniform(self) -> bool:  # type: ignore[override]
         return not any(isinstance(value, np.ndarray) for value in self.params.values())
 
     @property
@@ -130,7 +123,7 @@ class LatticeHamiltonian(LocalHamiltonian):
         return self.U == 0 and "fixed" not in self.boundary
 
     @cached_property
-    def terms(self) -> dict[str, str]:
+    def terms(self) -> dict[str, str]:  # type: ignore[override]
         """The terms by name, as texts with the values of the parameters in them: what does not depend on the size."""
         names = self.names
         rows = zip((self.x, self.p, self.r), (names["x"], names["p"], names["r"]), strict=True)
@@ -147,10 +140,7 @@ class LatticeHamiltonian(LocalHamiltonian):
         }
 
     def wells(self) -> list[np.ndarray]:
-        """The values of the fields (F,) at which all sites are at rest: the lowest minima of U, 0 without U.
-
-        U is first looked at along straight lines, at fields of all sizes, for the units in which it is minimized.
-        """
+        """The values of the fields (F,) at which all sites are at rest: the lowest minima of U, 0 without U."""
         n, rng = len(self.fields), np.random.default_rng(0)
         if self.U == 0:
             return [np.zeros(n)]
@@ -188,7 +178,7 @@ class LatticeHamiltonian(LocalHamiltonian):
         return [size * x for x in kept]
 
     @cached_property
-    def poles(self) -> Poles | None:  # type: ignore[override]
+    def poles(self) -> Poles | None:
         return LatticePoles(self) or None
 
     def remark(self, q: np.ndarray) -> str:
@@ -375,11 +365,13 @@ class LatticeHamiltonian(LocalHamiltonian):
         """The values of expressions of U and of each bond along each axis, at all sites and bonds."""
         x, found = self._on_sites(q), list[tuple[int | None, int, list[Array]]]()
         if self.U != 0:
-            found.append((None, 0, self._site_values(f"onsite {key}", partial(expressions, self.U, self.x), self.x, x)))
+            found.append((None, 0, self._at(None, f"onsite {key}", partial(expressions, self.U, self.x), self.x, x)))
         for axis, k in self._kinds():
             of_bond = partial(expressions, self.bonds[k], self.r)
-            values = self._bond_values(axis, k, key, of_bond, self.r, self._differences(x, axis, k))
-            found.append((axis, k, [self._own_bonds(value, axis, k) for value in values]))
+            values = self._at((axis, k), key, of_bond, self.r, self._differences(x, axis, k))
+            if self.boundary[axis] == "periodic":  # each bond once
+                values = [_cut(value, axis - len(self.shape), k, None) for value in values]
+            found.append((axis, k, values))
         return found
 
     def potential_gradient(self, q: Array) -> Array:
@@ -396,10 +388,10 @@ class LatticeHamiltonian(LocalHamiltonian):
 
     def _kinetic_of_sites(self, p: Array) -> Array:
         """T at each site: (..., d) to (..., *shape)."""
-        return self._site_values("kinetic", lambda: [self.T], self.p, self._on_sites(p))[0]
+        return self._at(None, "kinetic", lambda: [self.T], self.p, self._on_sites(p))[0]
 
     def kinetic_gradient(self, p: Array) -> Array:
-        slopes = self._site_values("kinetic 1", partial(_slopes, self.T, self.p), self.p, self._on_sites(p))
+        slopes = self._at(None, "kinetic 1", partial(_slopes, self.T, self.p), self.p, self._on_sites(p))
         return _joined(slopes, len(self.shape))
 
     def kinetic_hessian(self, p: Array) -> Array:
@@ -410,7 +402,7 @@ class LatticeHamiltonian(LocalHamiltonian):
         def entries() -> list[sp.Expr]:
             return [sp.diff(self.T, a, b) for a, b in product(self.p, self.p)]
 
-        values = self._site_values("kinetic 2", entries, self.p, self._on_sites(p))
+        values = self._at(None, "kinetic 2", entries, self.p, self._on_sites(p))
         sites = np.arange(n)
         for (i, j), value in zip(product(range(F), range(F)), values, strict=True):
             S[..., i * n + sites, j * n + sites] = value.reshape(*p.shape[:-1], n)
@@ -420,9 +412,9 @@ class LatticeHamiltonian(LocalHamiltonian):
         x, p = self._on_sites(y[..., : self.ndof]), y[..., self.ndof :]
         density = self._kinetic_of_sites(p)
         if self.U != 0:
-            density = density + self._site_values("onsite", lambda: [self.U], self.x, x)[0]
+            density = density + self._at(None, "onsite", lambda: [self.U], self.x, x)[0]
         for axis, k in self._kinds():
-            V = self._bond_values(axis, k, "", partial(list, [self.bonds[k]]), self.r, self._differences(x, axis, k))[0]
+            (V,) = self._at((axis, k), "", partial(list, [self.bonds[k]]), self.r, self._differences(x, axis, k))
             n, at = self.shape[axis], axis - len(self.shape)
             if self.boundary[axis] == "free":
                 V = _padded(V, at, k, "zeros")
@@ -448,11 +440,11 @@ class LatticeHamiltonian(LocalHamiltonian):
         out: list[Any] = [0.0] * len(self.fields)
         if self.U != 0:
             slopes = partial(_slopes, self.U, self.x, *given)
-            out = self._site_values(f"onsite {order}", slopes, sum(given, self.x), *parts)
+            out = self._at(None, f"onsite {order}", slopes, sum(given, self.x), *parts)
         for axis, k in self._kinds():
             slopes = partial(_slopes, self.bonds[k], self.r, *given)
             differences = [self._differences(x, axis, k) for x in parts]
-            values = self._bond_values(axis, k, str(order), slopes, sum(given, self.r), *differences)
+            values = self._at((axis, k), str(order), slopes, sum(given, self.r), *differences)
             n, at = self.shape[axis], axis - len(self.shape)
             for i, value in enumerate(values):
                 slope = _padded(value, at, k, "zeros") if self.boundary[axis] == "free" else value
@@ -474,50 +466,26 @@ class LatticeHamiltonian(LocalHamiltonian):
             found.append(_cut(around, at, k, n) - _cut(around, at, 0, n - k))
         return found
 
-    def _own_bonds(self, values: Array, axis: int, k: int) -> Array:
-        """The values of bonds, each once."""
-        at = axis - len(self.shape)
-        return _cut(values, at, k, values.shape[at]) if self.boundary[axis] == "periodic" else values
-
-    def _site_values(
-        self, key: str, expressions: Expressions, variables: Sequence[sp.Symbol], *arrays: Sequence[Array]
-    ) -> list[Array]:
-        return self._of_symbols(key, expressions, variables, [x for row in arrays for x in row], list(self._sites))
-
-    def _bond_values(
+    def _at(
         self,
-        axis: int,
-        k: int,
-        order: str,
+        bond: tuple[int, int] | None,
+        key: str,
         expressions: Expressions,
         variables: Sequence[sp.Symbol],
         *arrays: Sequence[Array],
     ) -> list[Array]:
+        """Values at all sites, or at the bonds along an axis over a distance."""
+        parameters: list[Any] = [*self.params.values()]
+        if bond is not None:
+            key = f"bond {bond[1]} {key}"
+            parameters = [self._of_first_ends(c, *bond) if isinstance(c, np.ndarray) else c for c in parameters]
         given = [x for row in arrays for x in row]
-        return self._of_symbols(f"bond {k} {order}", expressions, variables, given, self._of_bonds(axis, k))
-
-    def _of_symbols(
-        self,
-        key: str,
-        expressions: Expressions,
-        variables: Sequence[sp.Symbol],
-        arrays: Sequence[Array],
-        parameters: Sequence[Any],
-    ) -> list[Array]:
-        x = arrays[0]
-        values = self._values(key, expressions, (*variables, *self.c), *arrays, *(like(c, x) for c in parameters))
-        return [value + 0 * x if not getattr(value, "ndim", 0) else value for value in values]
-
-    @property
-    def _sites(self) -> tuple[Any, ...]:
-        """The values of the parameters, those of sites as arrays."""
-        return tuple(self.params.values())
-
-    def _of_bonds(self, axis: int, k: int) -> list[Any]:
-        """The same for the bonds along an axis: those at its first end, or of the first site where that is a wall."""
-        return [self._of_first_ends(c, axis, k) if isinstance(c, np.ndarray) else c for c in self._sites]
+        constants = (like(c, given[0]) for c in parameters)
+        values = self._values(key, expressions, (*variables, *self.c), *given, *constants)
+        return [value + 0 * given[0] if not getattr(value, "ndim", 0) else value for value in values]
 
     def _of_first_ends(self, values: np.ndarray, axis: int, k: int) -> np.ndarray:
+        """The values of sites at the first ends of bonds, or of the first site where that is a wall."""
         at, n, boundary = axis - len(self.shape), self.shape[axis], self.boundary[axis]
         if boundary == "free":
             return _cut(values, at, 0, n - k)
@@ -537,7 +505,7 @@ def _total(values: Array, shape: tuple[int, ...]) -> Array:
     return values.sum(tuple(range(-len(shape), 0)))
 
 
-def _cut(x: Array, axis: int, first: int, last: int) -> Array:
+def _cut(x: Array, axis: int, first: int, last: int | None) -> Array:
     """x[first:last] along an axis counted from the end."""
     return x[(..., slice(first, last), *[slice(None)] * (-1 - axis))]
 

@@ -12,6 +12,7 @@ import reprlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cached_property
+from types import MappingProxyType
 from typing import Any, Self
 
 import numpy as np
@@ -23,8 +24,6 @@ from sympflow.hamiltonian.definition import Definition, bare_copy
 from sympflow.hamiltonian.expression import complex_part, stated
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, generate, printable
 
-__all__ = ["LocalHamiltonian", "check_memory", "checked_params", "named_values", "numbered", "parsed"]
-
 MOST_SPELLED = 128  # degrees of freedom
 MOST_DENSE = 50_000_000  # entries of matrices ∇²V that are made at a time
 VECTORS_OF_A_RUN = 12
@@ -32,17 +31,17 @@ VECTORS_OF_A_RUN = 12
 
 
 class LocalHamiltonian(Definition, ABC):
-    """H = T(p) + V(q) as a sum over sites and bonds, or over pairs, by one expression for each kind of term.
-
-    A subclass defines `potential`, `potential_gradient`, `hessian_vector`, `third_derivative` and, unless T is
-    quadratic, `kinetic` and its derivatives; all of arrays and tensors (..., d), at the cost of O(d).
-    """
+    """H = T(p) + V(q) as a sum over sites and bonds, or over pairs, by one expression for each kind of term."""
 
     separable = True
     has_third_derivative = True
     shape: tuple[int, ...] = ()  # sites along the axes of a lattice
     ends: tuple[str, ...] = ()  # how each axis of a lattice ends
     noun: str = "system"  # in messages
+    has_subsystem: bool = False  # True if a few parts behave as those of a large system do
+    uniform: bool = False  # True if all sites or bodies are alike
+    apart: float = 1.0  # a distance at which the terms differ from others, if positions drawn about 0 do not tell
+    terms: Mapping[str, str] = MappingProxyType({})  # by name, as texts, for messages
     felt: np.ndarray | None = None
     """1 of the momenta that count in H, 0 of those of bodies without mass (d,); None where all do."""
     frame: Any = None
@@ -101,11 +100,6 @@ class LocalHamiltonian(Definition, ABC):
             f"by HamiltonianSystem.{self.loops}."
         )
 
-    @property
-    def has_subsystem(self) -> bool:
-        """True if a few parts behave as those of a large system do: `subsystem` is defined."""
-        return False
-
     def judged(self) -> tuple[Any, ...]:
         """Arguments of `subsystem` for a system that is large, and small enough to judge a flow on; () for itself."""
         return ()
@@ -120,24 +114,9 @@ class LocalHamiltonian(Definition, ABC):
         return self.ndof
 
     @property
-    def apart(self) -> float:
-        """A distance at which the terms of the system differ from others, if positions drawn about 0 do not tell."""
-        return 1.0
-
-    @property
     def numbers(self) -> int:
         """Numbers that a force by array operations handles."""
         return 2 * self.ndof
-
-    @property
-    def uniform(self) -> bool:
-        """True if all sites or bodies are alike, so that a few of them tell all of the rest."""
-        return False
-
-    @property
-    def terms(self) -> dict[str, str]:
-        """The terms by name, as texts, for messages; {} where there are no pieces."""
-        return {}
 
     @cached_property
     def spelled(self) -> SymbolicHamiltonian | None:

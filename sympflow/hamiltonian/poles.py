@@ -11,9 +11,7 @@ import mpmath
 import numpy as np
 import sympy as sp
 
-from sympflow.hamiltonian.removable import Min
-
-__all__ = ["LatticePoles", "PairsPoles", "Place", "Poles", "SymbolicPoles", "places"]
+from sympflow.hamiltonian.removable import Min, bose, elliptic_e, elliptic_k
 
 FACTORED = 8  # letters of a polynomial, at most, that is split into factors
 MOST_SHOWN = 100  # characters of terms
@@ -66,6 +64,9 @@ class Poles(Protocol):
     cancelling: Sequence[Cancelling]  # terms of H that cancel where each is infinite
     watched: bool  # False if H has cancelling terms alone
 
+    def __bool__(self) -> bool:
+        return self.watched or bool(self.cancelling)
+
     @property
     def exact(self) -> Poles | None:
         """The places by which runs are judged, where these may have passed one; None if they are not known."""
@@ -114,9 +115,6 @@ class SymbolicPoles(Poles):
         self._look = symbols.evaluated("cells", [*cells, symbols.H, T])
         self._sizes = symbols.evaluated("sizes", [place.g for place, _ in self._places])
 
-    def __bool__(self) -> bool:
-        return self.watched or bool(self.cancelling)
-
     def look(self, y: np.ndarray, t: Any, numbers: Sequence[Any] = ()) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         values = self._look(y, *self._time(y, t), numbers=numbers)
         return values[..., : self._m], values[..., -2], values[..., -1]
@@ -139,29 +137,10 @@ class SymbolicPoles(Poles):
         return (np.broadcast_to(t, y.shape[:-1]),) if self._symbols.timed else ()
 
 
-class _Lattice(Protocol):
-    """The attributes of a `LatticeHamiltonian` that poles need."""
-
-    ndof: int
-    shape: tuple[int, ...]
-    boundary: tuple[str, ...]
-    U: sp.Expr
-    x: tuple[sp.Symbol, ...]
-    r: tuple[sp.Symbol, ...]
-    c: tuple[sp.Symbol, ...]
-    bonds: dict[int, sp.Expr]
-    params: Any
-
-    @property
-    def names(self) -> dict[str, tuple[str, ...]]: ...
-
-    def of_terms(self, key: str, expressions: Any, q: Any) -> list[tuple[int | None, int, list[Any]]]: ...
-
-
 class LatticePoles(Poles):
     """The places of the terms of a lattice, at each site and bond."""
 
-    def __init__(self, lattice: _Lattice) -> None:
+    def __init__(self, lattice: Any) -> None:
         self._lattice = lattice
         terms = [(None, lattice.U, lattice.x), *((k, V, lattice.r) for k, V in lattice.bonds.items())]
         self.watched = any(places(f, x) for _, f, x in terms)
@@ -170,9 +149,6 @@ class LatticePoles(Poles):
             names = [sp.Symbol(name, real=True) for name in lattice.names["x" if k is None else "r"]]
             named = _with_numbers(f, lattice.c, lattice.params).xreplace(dict(zip(x, names, strict=True)))
             self.cancelling += [each._replace(bond=k) for each in cancelling(named, tuple(names))]
-
-    def __bool__(self) -> bool:
-        return self.watched or bool(self.cancelling)
 
     def visited(self, terms: Cancelling, y: np.ndarray) -> np.ndarray:
         rows = self._lattice.of_terms("own", lambda f, x: [*x], self._positions(y))
@@ -255,9 +231,6 @@ class PairsPoles(Poles):
         self.watched = bool(self._places)
         self._only_meet = not self._on_a_line and [place.cell for place in self._places] == [self._meeting]
         self.cancelling = cancelling(_with_numbers(self._f, pairs.c, pairs.params), (self._x,))
-
-    def __bool__(self) -> bool:
-        return self.watched or bool(self.cancelling)
 
     def may_pass(self, y: np.ndarray) -> bool:
         return not self._only_meet or self._pairs.may_pass(y)
@@ -343,14 +316,14 @@ _SINGULAR: dict[Any, Callable[..., Sequence[sp.Expr]]] = {
     sp.gamma: lambda a: [1 / sp.gamma(a)],
     sp.loggamma: lambda a: [1 / sp.gamma(a)],
     sp.LambertW: lambda a, *_: [a + sp.exp(-1).evalf(17)],
-    sp.elliptic_k: lambda m: [1 - m],
-    sp.elliptic_e: lambda *a: [1 - a[-1]],
+    elliptic_k: lambda m: [1 - m],
+    elliptic_e: lambda *a: [1 - a[-1]],
+    bose: lambda a: [a],
     sp.bessely: lambda n, a: [a],
     sp.besselk: lambda n, a: [a],
 }
 """Expressions that vanish where a function is infinite, or ends."""
-
-_ENDING = sp.log, sp.asin, sp.acos, sp.acosh, sp.atanh, sp.LambertW, sp.elliptic_k, sp.elliptic_e
+_ENDING = sp.log, sp.asin, sp.acos, sp.acosh, sp.atanh, sp.LambertW, elliptic_k, elliptic_e
 _ODD = sp.sinh, sp.tanh, sp.asinh, sp.atan, sp.erf, sp.sign
 
 
@@ -401,7 +374,11 @@ def _split(g: sp.Expr, x: tuple[sp.Symbol, ...]) -> Iterator[Place]:
         yield Place(g, sp.floor(g.args[0] / sp.pi + sp.Rational(1, 2)))
     elif (touched := _touched(g)) is not None:
         yield touched
-    elif len(g.free_symbols) <= FACTORED and _is_rational(g):
+    elif (
+        len(g.free_symbols) <= FACTORED
+        and g.is_rational_function(*g.free_symbols)
+        and all(a.exp.is_Integer for a in g.atoms(sp.Pow))
+    ):
         exact = g.xreplace({a: sp.nsimplify(a, rational=True) for a in g.atoms(sp.Number, sp.NumberSymbol)})
         exact, _ = sp.fraction(sp.together(exact))
         for factor, _ in sp.Poly(exact, *sorted(g.free_symbols, key=str), domain="QQ").factor_list()[1]:
@@ -444,11 +421,6 @@ def _of_polynomial(g: sp.Expr, x: tuple[sp.Symbol, ...]) -> Iterator[Place]:
     for root in sp.real_roots(sp.Poly(g, s)):
         root = root if root.is_Integer else root.evalf(17)  # noqa: PLW2901
         yield Place(s - root, sp.sign(s - root))
-
-
-def _is_rational(g: sp.Expr) -> bool:
-    """Return True for a ratio of polynomials of rational numbers and floats."""
-    return g.is_rational_function(*g.free_symbols) and all(a.exp.is_Integer for a in g.atoms(sp.Pow))
 
 
 def _plain(g: sp.Expr) -> sp.Expr:

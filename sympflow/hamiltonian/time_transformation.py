@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -14,14 +13,13 @@ from sympflow.arrays import Array, concatenate, library
 from sympflow.arrays import like as as_like
 from sympflow.hamiltonian.definition import Definition
 from sympflow.hamiltonian.domain import Domain
-from sympflow.hamiltonian.scene import Scene
-from sympflow.hamiltonian.system import HamiltonianSystem, Parameters
+from sympflow.hamiltonian.system import HamiltonianSystem, Parameters, Scene
+from sympflow.lazy import lately_kept
 
 if TYPE_CHECKING:
-    from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
+    pass
 
 LARGEST_SHIFT = 1e100
-_ENERGIES: WeakKeyDictionary[HamiltonianSystem, tuple[bytes, float]] = WeakKeyDictionary()
 
 
 def time_transformed(
@@ -87,8 +85,14 @@ def time_transformed(
             "method such as 'gauss_legendre4'."
         )
     c = default_shift(system) if shift is None else checked_shift(shift)
-    if _symbols(system) is not None:
-        transformed = HamiltonianSystem.from_sympy(_expression(system, c), name=f"log_{system.name}", energy_scale=1.0)
+    symbols = system.written if system.local is None else system.local.spelled  # with all terms one by one
+    if symbols is not None:
+        import sympy as sp
+
+        from sympflow.hamiltonian.symbolic import exact
+
+        H = sp.log(symbols.T + sp.Symbol(f"p{symbols.ndof + 1}", real=True)) - sp.log(exact(c) - symbols.V)
+        transformed = HamiltonianSystem.from_sympy(H, name=f"log_{system.name}", energy_scale=1.0)
         transformed._params = Parameters({**system.params, "shift": c})
     else:
         transformed = HamiltonianSystem.__new__(HamiltonianSystem)
@@ -105,17 +109,14 @@ def time_transformed(
 
 def default_shift(system: HamiltonianSystem) -> float:
     """c = E + |E| with the energy E of the system's y0: 0 for a bound system whose V vanishes far out, else 2E."""
-    E = 0.0 if system.y0 is None else _energy(system)
+    E = 0.0 if system.y0 is None else _energy(system, system.y0.tobytes())
     return E + abs(E) if math.isfinite(E) else 0.0
 
 
-def _energy(system: HamiltonianSystem) -> float:
+@lately_kept
+def _energy(system: HamiltonianSystem, y0: bytes) -> float:
     """H at the system's y0, kept: every run asks for it several times."""
-    y0 = np.asarray(system.y0, dtype=float)
-    known = _ENERGIES.get(system)
-    if known is None or known[0] != y0.tobytes():
-        known = _ENERGIES[system] = y0.tobytes(), float(system.hamiltonian(y0))
-    return known[1]
+    return float(system.hamiltonian(np.frombuffer(y0).copy()))
 
 
 def checked_shift(shift: Any) -> float:
@@ -133,7 +134,7 @@ def time_scale(system: HamiltonianSystem, c: float) -> float:
     """ds/dt where the kinetic energy equals B = c − E, at the energy E of the system's y0: 2B."""
     if system.y0 is None:
         return 1.0
-    B = c - _energy(system)
+    B = c - _energy(system, system.y0.tobytes())
     scale = 2 * B if B > 0 else c - float(system.potential(system.y0[: system.ndof]))
     if not scale > 0:
         raise ValueError(
@@ -153,22 +154,6 @@ def projected(x: Array) -> Array:
     """[q, p] of states [q, t, p, B]."""
     d = x.shape[-1] // 2 - 1
     return concatenate([x[..., :d], x[..., d + 1 : -1]])
-
-
-def _symbols(system: HamiltonianSystem) -> SymbolicHamiltonian | None:
-    """H in symbols, of a lattice or pairs with all terms one by one."""
-    return system.written if system.local is None else system.local.spelled
-
-
-def _expression(system: HamiltonianSystem, c: float) -> Any:
-    import sympy as sp
-
-    from sympflow.hamiltonian.symbolic import exact
-
-    symbols = _symbols(system)
-    assert symbols is not None
-    B = sp.Symbol(f"p{symbols.ndof + 1}", real=True)
-    return sp.log(symbols.T + B) - sp.log(exact(c) - symbols.V)
 
 
 class _Logarithmic(Definition):
@@ -215,4 +200,4 @@ class _Logarithmic(Definition):
 def _bordered(S: Array) -> Array:
     """S (..., d, d) with a row and a column of zeros added."""
     wide = concatenate([S, 0 * S[..., :1]])
-    return concatenate([wide.swapaxes(-1, -2), 0 * wide.swapaxes(-1, -2)[..., :1]]).swapaxes(-1, -2)
+    return concatenate([wide, 0 * wide[..., :1, :]], -2)

@@ -8,7 +8,6 @@ from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, cast
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -29,16 +28,17 @@ from sympflow.integrators.clocks import (
     transformed_system,
 )
 from sympflow.integrators.contract import Failure, Outcome, Problem, Steps
-from sympflow.integrators.domain_exit import check_start
+from sympflow.integrators.diagnosis import check_start
 from sympflow.integrators.grid_runs import grid_run
+from sympflow.integrators.registry import is_flow
 from sympflow.integrators.steppers import ArraySteps, Stepper, compiled_loops, rollout
 from sympflow.kernels.protocol import RunCheckpoint
+from sympflow.lazy import kept
 
 if TYPE_CHECKING:  # and torch, which compiled runs of flows that ship do without
     from sympflow.flow.flow_map import FlowMap
 
 T = TypeVar("T")
-
 SEARCH, SEARCH_OF_EACH = 60_000, 2_000
 """Forces that take as long as what a run in another time needs besides, and each trajectory in a batch."""
 AT_A_TIME, AT_A_TIME_OF_EACH = 100, 600
@@ -56,23 +56,19 @@ def known(key: tuple[Any, ...], make: Callable[[], T]) -> T:
 
 
 _KINDS_OF_SYSTEM: dict[tuple[Any, ...], int] = {}
-_KIND_OF: WeakKeyDictionary[HamiltonianSystem, int] = WeakKeyDictionary()
-_FLOWS_OF: WeakKeyDictionary[HamiltonianSystem, dict[tuple[Any, ...], KnownFlow]] = WeakKeyDictionary()
 
 
+@kept
 def kind_of(system: HamiltonianSystem) -> int:
     """A number that systems with the same formula and the same flows share, by which flows that ship are kept."""
-    kind = _KIND_OF.get(system)
-    if kind is None:
-        found = system.fingerprint, system.expression, tuple(f.name for f in shipped_flows(system))
-        kind = _KIND_OF[system] = _KINDS_OF_SYSTEM.setdefault(found, len(_KINDS_OF_SYSTEM))
-    return kind
+    found = system.fingerprint, system.expression, tuple(f.name for f in shipped_flows(system))
+    return _KINDS_OF_SYSTEM.setdefault(found, len(_KINDS_OF_SYSTEM))
 
 
-def is_flow(flow: Any) -> bool:
-    """True for a trained flow: there is none unless its module has been imported, with torch."""
-    flows = sys.modules.get("sympflow.flow.flow_map")
-    return flows is not None and isinstance(flow, flows.FlowMap)
+@kept
+def _shipped(system: HamiltonianSystem, name: str, tolerance: float | None) -> KnownFlow:
+    """The flow of a kind that ships for a system."""
+    return known((name, kind_of(system), tolerance), lambda: choose(system, name, tolerance).known(system))
 
 
 def checked_flow(flow: Any, kind: str, what: str) -> Any:
@@ -101,7 +97,6 @@ class FlowIntegrator(FixedStep):
     """
 
     flow: Any = field(default=None, repr=False)
-
     order: ClassVar[int | None] = None
     trained: ClassVar[bool] = True
     compiles: ClassVar[bool] = True
@@ -132,16 +127,7 @@ class FlowIntegrator(FixedStep):
         return self.known_flow(system).thawed
 
     def known_flow(self, system: HamiltonianSystem) -> KnownFlow:
-        if self.flow is not None:
-            return self.flow.bound(system)
-        asked = name, tolerance = self.name, self.tolerance
-        flows = _FLOWS_OF.get(system)
-        if flows is None:
-            flows = _FLOWS_OF[system] = {}
-        if asked not in flows:
-            key = (name, kind_of(system), tolerance)
-            flows[asked] = known(key, lambda: choose(system, name, tolerance).known(system))
-        return flows[asked]
+        return _shipped(system, self.name, self.tolerance) if self.flow is None else self.flow.bound(system)
 
     def on_extended(self, system: HamiltonianSystem, extended: HamiltonianSystem) -> FlowIntegrator | None:
         flow = self.flow_for(system).on_extended(extended)
@@ -236,7 +222,9 @@ class FlowSteps(ArraySteps):
         import torch
 
         if not is_tensor(y0):
-            inner = _as_tensors(carry)
+            inner = None if carry is None else RunCheckpoint()
+            if carry is not None and carry.running is not None:
+                inner = RunCheckpoint(carry.steps, torch.from_numpy(carry.running))
             with torch.no_grad():
                 whole = torch.from_numpy(np.ascontiguousarray(y0))
                 states, finite = self.rollout(whole, h, n_steps, save, t0, inner)
@@ -266,15 +254,6 @@ class FlowSteps(ArraySteps):
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
         return self.flow.evaluations(n_steps, n_saved, n_extra, backend)
-
-
-def _as_tensors(carry: RunCheckpoint | None) -> RunCheckpoint | None:
-    """A carry of arrays as one of tensors."""
-    if carry is None or carry.running is None:
-        return None if carry is None else RunCheckpoint()
-    import torch
-
-    return RunCheckpoint(carry.steps, torch.from_numpy(carry.running))
 
 
 def _apply(function: Any, y: Array, h: float | Array, t: Any) -> Array:
@@ -314,7 +293,6 @@ class SympFlowIntegrator(FlowIntegrator):
 
     tol: float | None = None
     compensated: bool = False
-
     name: ClassVar[str] = "sympflow"
     source: ClassVar[str] = "A trained SympFlow: symplectic for every step length, with an exact inverse."
     symplectic: ClassVar[bool] = True
@@ -343,7 +321,12 @@ class SympFlowIntegrator(FlowIntegrator):
     def resolved(self, system: HamiltonianSystem, y0: Array, length: float, n_times: int = 0) -> FixedStep:
         """Return the integrator that runs: with `tol`, over a `length` that is worth it, a flow in another time."""
         if self.flow is not None:
-            return self._given_in_another_time(system)
+            origin = self.flow.origin
+            if origin is None or not origin.is_of(system):
+                return self
+            if self.compensated:
+                raise ValueError("`compensated` sums are not for a flow in another time: leave it out.")
+            return LogSympFlow(flow=self.flow, shift=origin.shift, dt=self.dt)
         if self.tol is None or self.compensated or y0.dtype != np.float64:
             return self
         name, tol = self.name, self.tol
@@ -357,14 +340,6 @@ class SympFlowIntegrator(FlowIntegrator):
             return self
         check_start(flow, system, y0, False)
         return LogSympFlow(flow=flow, shift=shift)
-
-    def _given_in_another_time(self, system: HamiltonianSystem) -> FixedStep:
-        origin = self.flow.origin
-        if origin is None or not origin.is_of(system):
-            return self
-        if self.compensated:
-            raise ValueError("`compensated` sums are not for a flow in another time: leave it out.")
-        return LogSympFlow(flow=self.flow, shift=origin.shift, dt=self.dt)
 
     def kernel(self, flow: KnownFlow, problem: Problem) -> Any:
         if not self.compensated:
@@ -439,7 +414,6 @@ class LogSympFlow(FixedStep):
 
     shift: float | None = None
     flow: Any = field(default=None, repr=False)
-
     name: ClassVar[str] = "log_sympflow"
     order: ClassVar[int | None] = None
     symplectic: ClassVar[bool] = True

@@ -6,8 +6,6 @@ import math
 
 import numpy as np
 
-from sympflow.hamiltonian.system import HamiltonianSystem
-
 EPS = float(np.finfo(float).eps)
 MOST_STEPS = 10**11
 """A run of more is refused: at the 10 ns of the cheapest compiled step it takes a quarter of an hour."""
@@ -15,9 +13,9 @@ MOST_OPEN_STEPS = 1_000_000
 """A run whose interval has no end is ended after so many: an event that never comes would be waited for, for ever."""
 
 
-def open_end(t0: float, t1: float, dt: float, most: int = MOST_OPEN_STEPS) -> float:
+def open_end(t0: float, t1: float, dt: float) -> float:
     """Return t1, or for an infinite one the end of `most` steps of length dt."""
-    return t1 if math.isfinite(t1) else t0 + math.copysign(most * dt, t1)
+    return t1 if math.isfinite(t1) else t0 + math.copysign(MOST_OPEN_STEPS * dt, t1)
 
 
 def no_event(n_steps: int, t: float) -> str:
@@ -26,44 +24,6 @@ def no_event(n_steps: int, t: float) -> str:
         f"No terminal event ended the run within {n_steps:,} steps, up to t = {t:.15g}. Check the event, or give "
         "`t_span` a finite end, however late."
     )
-
-
-def jumps_met(
-    system: HamiltonianSystem, t0: float, t1: float, dt: float, method: str | None
-) -> tuple[str, list[float]]:
-    """Words where H jumps within a step, or at the end of one at which the `method` takes a force; and all jumps."""
-    times = system.jump_times(min(t0, t1), max(t0, t1), dt / 4)
-    x = (times - t0) / dt
-    within = np.abs(x - np.round(x)) > np.maximum(1e-9, 8 * EPS * np.maximum(abs(t0), np.abs(times)) / dt)
-    ends = [] if method is None else [t for t in (t0, t1) if _jumps_into(system, t, t0, t1, dt)]
-    met = sorted([*ends, *times.tolist()], reverse=t1 < t0)
-    if within.any():
-        first = times[within][0 if t1 > t0 else -1]
-        said = (
-            f"`dt` {dt:g}: H of {system.name!r} jumps within a step, at t = {first:.6g}, where every method is of "
-            "first order. Choose a `dt` that divides all pieces between jumps from t0 on, or solve from jump to jump."
-        )
-    elif method is None or not met:
-        return "", []
-    else:
-        said = (
-            f"`method` {method!r} takes forces at the ends of its steps, and H of {system.name!r} jumps at one, at "
-            f"t = {met[0]:.6g}: it is of first order there. Use one that takes none, such as 'leapfrog', 'kahan_li8' "
-            "or 'gauss_legendre6'."
-        )
-    return said, met
-
-
-def _jumps_into(system: HamiltonianSystem, t: float, t0: float, t1: float, dt: float) -> bool:
-    """Return True if H jumps at an end t of a run, and its value there is not that within the run."""
-    near = 4 * EPS * abs(t) + 1e-9 * dt
-    if not len(system.jump_times(t - near, t + near, dt / 4)):
-        return False
-    y = np.random.default_rng(0).uniform(-1, 1, (16, 2 * system.ndof)) * 10.0 ** np.arange(-8, 8)[:, None]
-    inward = math.copysign(1e-6 * dt, (t0 + t1) / 2 - t)
-    with np.errstate(all="ignore"):
-        outside, at, inside = (system.hamiltonian(y, t + s * inward) for s in (-1, 0, 1))
-        return bool((np.abs(at - inside) > 0.01 * np.abs(outside - inside)).any())
 
 
 class Grid:
@@ -118,10 +78,7 @@ class Grid:
 
 
 class Outputs:
-    """The outputs of a run by their numbers 0 … n − 1, of which a part is made at a time.
-
-    These are the times of `t_eval`, or those of every `save_every`-th step and the end.
-    """
+    """The outputs of a run by their numbers 0 … n − 1, of which a part is made at a time."""
 
     def __init__(self, grid: Grid, t_eval: np.ndarray | None, save_every: int) -> None:
         self.grid, self.t_eval, self.every = grid, t_eval, save_every

@@ -28,16 +28,7 @@ from sympflow.arrays import (
     unfollowed,
 )
 from sympflow.events import EventSearch
-from sympflow.integrators.contract import (
-    ENDED,
-    FINISHED,
-    INTERRUPTED,
-    Failure,
-    Outcome,
-    Problem,
-    finished,
-    interrupted,
-)
+from sympflow.integrators.contract import ENDED, FINISHED, INTERRUPTED, Failure, Outcome, Problem, finished, interrupted
 from sympflow.integrators.grid import Grid, Outputs, distinct
 from sympflow.integrators.interpolants import DenseOutput
 from sympflow.integrators.steppers import Stepper, shorter_steps
@@ -107,14 +98,10 @@ class Run(ABC):
 
     def stats(self, n_told: int, n_steps: int, n_saved: int, n_extra: int) -> dict[str, Any]:
         """Return the statistics of n_steps steps, n_saved states and n_extra shorter steps."""
-        stepper = self.stepper
-        return {
-            "dt": self.dt,
-            "n_steps": n_told,
-            **stepper.evaluations(n_steps, n_saved, n_extra),
-            "backend": stepper.backend + stepper.why,
-            **stepper.more_stats(),
-        }
+        stepper, arrays = self.stepper, self.stepper.arrays
+        stats: dict[str, Any] = {"dt": self.dt, "n_steps": n_told, **stepper.evaluations(n_steps, n_saved, n_extra)}
+        stats["backend"] = stepper.backend + stepper.why
+        return stats | {"newton_iterations": arrays.iterations} if arrays.stages else stats
 
 
 class GridRun(Run):
@@ -266,8 +253,8 @@ class GridSolution(DenseOutput):
 class Pace:
     """The lengths of windows, by the time that the last one took."""
 
-    def __init__(self, first: int, seconds: float = SECONDS) -> None:
-        self.n, self.seconds = first, seconds
+    def __init__(self, first: int) -> None:
+        self.n = first
         self.started = time.perf_counter()
 
     def steps(self, left: int) -> int:
@@ -278,7 +265,7 @@ class Pace:
     def took(self, n: int) -> None:
         """Note that the window, of n steps, has ended."""
         elapsed = time.perf_counter() - self.started
-        self.n = max(1, min(GROWTH * n, int(n * self.seconds / elapsed) if elapsed > 0 else GROWTH * n))
+        self.n = max(1, min(GROWTH * n, int(n * SECONDS / elapsed) if elapsed > 0 else GROWTH * n))
 
 
 # outputs in memory ----------------------------------------------------------------------------------------------------

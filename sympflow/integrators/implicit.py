@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -15,7 +16,7 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.times import stage_time
 from sympflow.integrators.base import FixedStep
 from sympflow.integrators.contract import Failure, Problem, method_class
-from sympflow.integrators.steppers import ArraySteps, Stepper, compiled_loops, followed_loops
+from sympflow.integrators.steppers import ArraySteps, Stepper, stepper_of
 
 _BUTCHER = "J. C. Butcher, Implicit Runge–Kutta processes, Math. Comp. 18 (1964) 50–64"
 _SYMPLECTIC = (
@@ -56,7 +57,6 @@ class Gauss(FixedStep):
     """
 
     compensated: bool = False
-
     symplectic: ClassVar[bool] = True
     compiles: ClassVar[bool] = True
     takes_friction: ClassVar[bool] = True
@@ -96,19 +96,8 @@ class Gauss(FixedStep):
     def own_stepper(self, problem: Problem) -> Stepper:
         from sympflow.kernels.newton import implicit_kernel
 
-        given, told = (problem.system, self.tableau, bool(self.compensated)), list[str]()
-        arrays = GaussSteps(problem.system, self.tableau)
-        if problem.followed:
-            return Stepper(self, problem, arrays, followed_loops(lambda names: implicit_kernel(*given, names), problem))
-        kernel = compiled_loops(
-            lambda: implicit_kernel(*given),
-            problem.y0,
-            problem.backend,
-            self.compensated,
-            told=told,
-            system=problem.system,
-        )
-        return Stepper(self, problem, arrays, kernel, told)
+        make = partial(implicit_kernel, problem.system, self.tableau, bool(self.compensated))
+        return stepper_of(self, problem, GaussSteps(problem.system, self.tableau), make, self.compensated)
 
 
 class GaussSteps(ArraySteps):

@@ -13,7 +13,7 @@ import numpy as np
 from sympflow.arrays import Array, concatenate
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.contract import Integrator, Interrupted, Outcome, Problem, finished, interrupted
-from sympflow.integrators.grid import EPS, jumps_met
+from sympflow.integrators.grid import EPS
 
 Run = Callable[[Integrator, Problem], tuple[Outcome, Problem]]
 MOST_LANDINGS = 20_000  # jumps at which a run is cut; one with more is not, and warns
@@ -22,28 +22,69 @@ ASIDE = 64 * EPS
 
 
 def landings(
-    integrator: Integrator, system: HamiltonianSystem, t0: float, t1: float, able: bool = True
+    integrator: Integrator, system: HamiltonianSystem, t0: float, t1: float, able: bool = True, kinks: bool = False
 ) -> tuple[str, list[float]]:
-    """The warning of a run that loses its order at jumps of H in t; or, if it is `able`, those at which it is cut."""
+    """The warning of a run that loses its order at jumps of H in t; or, if it is `able`, those at which it is cut.
+
+    By fixed steps of more than second order it is cut at `kinks` of H too.
+    """
     if not system.definition.may_jump or not math.isfinite(t1) or t0 == t1:
         return "", []
-    dt, label = integrator.step_length(system), integrator.label if integrator.forces_at_ends(system) else None
-    step, said = (dt or system.dt) / 4, ""
-    if dt is None:  # its steps may be longer than a pulse
-        times = system.jump_times(min(t0, t1), max(t0, t1), step).tolist()
-        if times:
+    dt, at_ends, said = integrator.step_length(system), integrator.forces_at_ends(system), ""
+    step = (dt or system.dt) / 4
+    times = system.jump_times(min(t0, t1), max(t0, t1), step).tolist()
+    if dt is None and times:  # its steps may be longer than a pulse
+        said = (
+            f"`t_span` ({t0:g}, {t1:g}): H of {system.name!r} jumps in t, at t = {times[0]:.6g} and {len(times):,} "
+            f"times or more, where {integrator.name!r} ends no step: it is of first order there, or leaps over a "
+            "pulse. Solve in shorter intervals, or by a fixed `dt` that divides all pieces between jumps."
+        )
+    elif dt is not None:
+        within = _within(times, t0, dt)
+        ends = [t for t in (t0, t1) if at_ends and _jumps_into(system, t, t0, t1, dt)]
+        times = sorted([*ends, *times], reverse=t1 < t0)
+        if len(within):
             said = (
-                f"`t_span` ({t0:g}, {t1:g}): H of {system.name!r} jumps in t, at t = {times[0]:.6g} and {len(times):,} "
-                f"times or more, where {integrator.name!r} ends no step: it is of first order there, or leaps over a "
-                "pulse. Solve in shorter intervals, or by a fixed `dt` that divides all pieces between jumps."
+                f"`dt` {dt:g}: H of {system.name!r} jumps within a step, at t = {within[0 if t1 > t0 else -1]:.6g}, "
+                "where every method is of first order. Choose a `dt` that divides all pieces between jumps from t0 on, "
+                "or solve from jump to jump."
             )
-    else:
-        said, times = jumps_met(system, t0, t1, dt, label)
-    able = able and len(times) <= MOST_LANDINGS and not integrator.forces_beyond(system)
-    # all times are known, of which the first ones may be listed
-    if able and times and not len(system.jump_times(max(times), max(t0, t1), step)):
-        return "", times
+        elif at_ends and times:
+            said = (
+                f"`method` {integrator.label!r} takes forces at the ends of its steps, and H of {system.name!r} jumps "
+                f"at one, at t = {times[0]:.6g}: it is of first order there. Use one that takes none, such as "
+                "'leapfrog', 'kahan_li8' or 'gauss_legendre6'."
+            )
+    if not able or integrator.forces_beyond(system):
+        return said, []
+    cuts = [(times, False)] if said else []
+    if kinks and dt is not None and (integrator.order or 0) > 2:
+        bends = system.jump_times(min(t0, t1), max(t0, t1), step, True)
+        if len(_within(bends, t0, dt)):
+            cuts.insert(0, (sorted({*bends.tolist(), *times}), True))
+    for met, bent in cuts:  # all times are known, of which the first ones may be listed
+        if 0 < len(met) <= MOST_LANDINGS and not len(system.jump_times(max(met), max(t0, t1), step, bent)):
+            return "", met
     return said, []
+
+
+def _within(times: Any, t0: float, dt: float) -> np.ndarray:
+    """The times (n,) that are no ends of steps from t0."""
+    t = np.array(times)
+    x = (t - t0) / dt
+    return t[np.abs(x - np.round(x)) > np.maximum(1e-9, 8 * EPS * np.maximum(abs(t0), np.abs(t)) / dt)]
+
+
+def _jumps_into(system: HamiltonianSystem, t: float, t0: float, t1: float, dt: float) -> bool:
+    """Return True if H jumps at an end t of a run, and its value there is not that within the run."""
+    near = 4 * EPS * abs(t) + 1e-9 * dt
+    if not len(system.jump_times(t - near, t + near, dt / 4)):
+        return False
+    y = np.random.default_rng(0).uniform(-1, 1, (16, 2 * system.ndof)) * 10.0 ** np.arange(-8, 8)[:, None]
+    inward = math.copysign(1e-6 * dt, (t0 + t1) / 2 - t)
+    with np.errstate(all="ignore"):
+        outside, at, inside = (system.hamiltonian(y, t + s * inward) for s in (-1, 0, 1))
+        return bool((np.abs(at - inside) > 0.01 * np.abs(outside - inside)).any())
 
 
 def spans(t0: float, t1: float, ends: Collection[float], jumps: Sequence[float]) -> list[tuple[float, float, float]]:
@@ -57,7 +98,7 @@ def spans(t0: float, t1: float, ends: Collection[float], jumps: Sequence[float])
 
 def pieces_of(integrator: Integrator, system: HamiltonianSystem, t0: float, t1: float) -> list[tuple[float, float]]:
     """The pieces of a run of a system without impulses."""
-    return [piece[:2] for piece in spans(t0, t1, [], landings(integrator, system, t0, t1)[1])]
+    return [piece[:2] for piece in spans(t0, t1, [], landings(integrator, system, t0, t1, kinks=True)[1])]
 
 
 def run_in_pieces(
@@ -148,10 +189,7 @@ def _merged(found: list[Outcome], problem: Problem, pieces: list[Any], impulses:
 
 @dataclass(frozen=True)
 class PiecewiseSolution:
-    """The dense output of a run in pieces: that of the piece in which t lies, at an impulse the later one.
-
-    `spans` (n, 2) are their ends, which decrease in a run back in time.
-    """
+    """The dense output of a run in pieces: that of the piece in which t lies, at an impulse the later one."""
 
     pieces: tuple[Callable[[Any], Array], ...]
     spans: np.ndarray

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any
 
@@ -40,7 +39,8 @@ def provenance(
     told: dict[str, Any] = {"sympflow_version": __version__, "system": system.name}
     if system.symbols is not None and len(system.symbols.text) <= LONGEST_EXPRESSION:
         told["hamiltonian"] = str(system.symbols.written[0])
-    told["params"] = json.dumps(_plain(system.params))
+    plain = {name: x if isinstance(x, int | float) else str(x) for name, x in system.params.items()}
+    told["params"] = json.dumps(plain)
     if system.damping is not None:
         told["damping"] = json.dumps(system.damping.tolist())
     told |= {"method": name_of(integrator), "options": option_text(integrator), "t_span": list(t_span)}
@@ -72,8 +72,3 @@ def run_identity(problem: Problem, integrator: Integrator, dt: float | None) -> 
     }
     known.add("y0", f"{y0.dtype} of shape {y0.shape}", y0)
     return known
-
-
-def _plain(params: Mapping[str, Any]) -> dict[str, Any]:
-    """Parameters as JSON has them: samples of functions of t by their text."""
-    return {name: value if isinstance(value, int | float) else str(value) for name, value in params.items()}

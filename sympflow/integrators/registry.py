@@ -8,7 +8,7 @@ from collections.abc import Callable
 from functools import cache, lru_cache
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from sympflow.arguments import OF_RUNS, advice, closest
+from sympflow.arguments import OF_RUNS, advice, did_you_mean
 from sympflow.arrays import Array
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.contract import Integrator
@@ -21,10 +21,8 @@ if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
 T = TypeVar("T")
-
 GROUP = "sympflow.integrators"
 """The entry-point group in which a distribution announces its integrators: `name = "package.module:Class"`."""
-
 _FIXED = {
     **dict.fromkeys(
         ("rtol", "atol", "reltol", "abstol"), "it has fixed steps: give `dt`, or `tol`, which chooses one."
@@ -113,20 +111,12 @@ def get(method: str | type[Integrator]) -> type[Integrator]:
         return get(name)
     if name in SYNONYMS:
         return get(SYNONYMS[name])
-    raise ValueError(f"`method` {method!r} is unknown. {_instead(name)}{_kinds()}")
-
-
-def _instead(name: str) -> str:
-    """The advice for the name of a method that is not there."""
-    if name in ABSENT:
-        return f"{ABSENT[name]} "
-    close = closest(name, [*available(), *SYNONYMS])
-    return f"Did you mean {close!r}? " if close else ""
-
-
-def _kinds() -> str:
+    instead = f" {ABSENT[name]}" if name in ABSENT else did_you_mean(name, [*available(), *SYNONYMS])
     rows = "".join(f"\n  {kind:42}{', '.join(map(repr, names))}" for kind, names in KINDS.items())
-    return f"There are, among others:{rows}\nAll are listed by sympflow.available()."
+    raise ValueError(
+        f"`method` {method!r} is unknown.{instead} There are, among others:{rows}\n"
+        "All are listed by sympflow.available()."
+    )
 
 
 @cache
@@ -194,7 +184,7 @@ def build(method: Any, options: dict[str, Any]) -> Integrator:
                     "one."
                 )
             return method
-        if _is_flow(method):
+        if is_flow(method):
             if not options:
                 return get(method.kind)(flow=method)  # type: ignore[call-arg]
             options = {"flow": method, **options}
@@ -239,7 +229,7 @@ def _made(method: Any, make: Callable[[], T]) -> T:
         ) from error
 
 
-def _is_flow(method: Any) -> bool:
+def is_flow(method: Any) -> bool:
     """True for a trained flow: there is none unless its module has been imported, with torch."""
     flows = sys.modules.get("sympflow.flow.flow_map")
     return flows is not None and isinstance(method, flows.FlowMap)

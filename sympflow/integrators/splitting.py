@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import copyreg
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cache, partial
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from sympflow.arguments import check_flag, check_one_of, check_positive
-from sympflow.arrays import Array, to_numpy
+from sympflow.arguments import check_flag, check_one_of, check_positive, warn
+from sympflow.arrays import Array, to_numpy, values
+from sympflow.events import EventSearch
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.time_transformation import checked_shift
 from sympflow.integrators.base import FixedStep
@@ -19,6 +20,7 @@ from sympflow.integrators.clocks import ARRAYS_ONLY, LogarithmicClock, scale_of,
 from sympflow.integrators.compositions import SPLITTINGS, Composition
 from sympflow.integrators.contract import (
     Failure,
+    Interrupted,
     Outcome,
     Problem,
     Steps,
@@ -27,13 +29,14 @@ from sympflow.integrators.contract import (
     in_blocks,
     method_class,
 )
-from sympflow.integrators.extended import extended_run
+from sympflow.integrators.interpolants import Mapped
 from sympflow.integrators.methods import NAMES, TRIPLES
-from sympflow.integrators.steppers import Stepper, compiled_loops, followed_loops
+from sympflow.integrators.steppers import Stepper, compiled_loops, stepper_of
 from sympflow.schemes import CORRECTORS, POLYNOMIAL, SCHEMES, Scheme, checked_scheme, scheme_evaluations, scheme_named
 
 if TYPE_CHECKING:
     from sympflow.kernels.tangents import TangentKernel
+    from sympflow.storage.runs import RunStore
 
 
 END = 1e-9
@@ -42,10 +45,7 @@ END = 1e-9
 
 @dataclass(frozen=True)
 class Clock:
-    """A time in which steps are equal, with the traits of the contract that depend on it.
-
-    `on` makes of a method and a system the method on the clock; None for the physical time, which needs none.
-    """
+    """A time in which steps are equal, with the traits of the contract that depend on it."""
 
     on: Callable[[Splitting, HamiltonianSystem], LogarithmicClock] | None = None
     finds_events: bool = True
@@ -162,7 +162,6 @@ class Splitting(FixedStep):
     shift: float | None = None
     omega: float | None = None
     corrector: int | None = None
-
     scheme: ClassVar[Scheme]
     symplectic: ClassVar[bool] = True
     compiles: ClassVar[bool] = True
@@ -364,27 +363,16 @@ class Splitting(FixedStep):
 
     def own_stepper(self, problem: Problem) -> Stepper:
         composition, compensated = self.composed(problem.system), bool(self.compensated)
-        told: list[str] = []
-        if problem.followed:
-            kernel = followed_loops(lambda names: composition.kernel_by(compensated, names), problem)
-            return Stepper(self, problem, composition, kernel)
-        kernel = compiled_loops(
-            lambda: composition.kernel(compensated),
-            problem.y0,
-            problem.backend,
-            compensated,
-            told=told,
-            system=problem.system,
-        )
-        if problem.parameter_values is not None:
-            kernel = kernel.varied(problem.parameter_values)
-        return Stepper(self, problem, composition, kernel, told)
+        make = composition.kernel_by if problem.followed else composition.kernel
+        return stepper_of(self, problem, composition, partial(make, compensated), compensated)
 
     def run(self, problem: Problem) -> Outcome:
         clock = self.on_clock(problem.system)
         if clock is not None:
             return clock.run(problem)
-        return extended_run(super().run, self.composed(problem.system), problem) if self.keeps else super().run(problem)
+        return (
+            _extended_run(super().run, self.composed(problem.system), problem) if self.keeps else super().run(problem)
+        )
 
     def steps(self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array) -> Steps:
         clock = self.on_clock(system)
@@ -394,6 +382,81 @@ class Splitting(FixedStep):
         composition = self.composed(system)
         for times, states, lengths in super().steps(system, t_span, composition.lift(y0)):
             yield times, composition.project(states), lengths
+
+
+# runs on an extended phase space -----------------------------------------------------------------
+
+APART = 0.1  # distance of two copies, over the size of the states of the run, beyond which these mean little
+
+
+def _extended_run(run: Callable[[Problem], Outcome], extension: Composition, problem: Problem) -> Outcome:
+    """The outcome of a problem that is run on an extended phase space."""
+    search = problem.events
+    lifted, before = None, []
+    if search is not None:  # which may go on from an earlier piece of the run
+        projected = (replace(e, g=lambda t, x, g=e.g: g(t, extension.project(x))) for e in search.events)  # type: ignore
+        lifted, before = EventSearch(tuple(projected), search.max_interval), search.found
+        lifted.found, lifted.values, lifted.n_dense = [[*zeros] for zeros in before], search.values, search.n_dense
+    store = problem.store
+    if store is not None:
+        store.project = lambda x: _noted(store, extension, x)
+    stopped = None
+    try:
+        outcome = run(replace(problem, y0=extension.lift(problem.y0), events=lifted))
+    except Interrupted as stop:
+        outcome, stopped = stop.outcome, stop
+    x = outcome.y
+    if search is not None and lifted is not None:
+        search.found = [
+            old + [(t, extension.project(y)) for t, y in zeros[len(old) :]]
+            for old, zeros in zip(before, lifted.found, strict=True)
+        ]
+        search.values = lifted.values
+        search.end = None if lifted.end is None else (lifted.end[0], extension.project(lifted.end[1]))
+        search.n_dense = lifted.n_dense
+    outcome.y = extension.project(x)
+    if outcome.sol is not None:
+        outcome.sol = Mapped(outcome.sol, extension.project)
+    found = None
+    if store is not None and "copy_distance" in store.noted:
+        found = np.array([store.noted[name] for name in ("copy_distance", "size")])
+    elif len(x) and (seen := values(x)) is not None:  # under vmap those of all lanes, which come first
+        with np.errstate(all="ignore"):
+            found = np.asarray(extension.distance(seen)).max(seen.ndim - x.ndim)
+    if found is not None:
+        _note_distance(extension, found, outcome)
+    if stopped is not None:
+        raise stopped
+    return outcome
+
+
+def _noted(store: RunStore, extension: Composition, x: np.ndarray) -> np.ndarray:
+    """The states of those of the extended space; a store keeps how far these are from ones that stand for a state."""
+    with np.errstate(all="ignore"):
+        found = np.asarray(extension.distance(x)).reshape(-1, 2)
+    if not np.isnan(found).all():
+        apart, size = np.nanmax(found, axis=0).tolist()
+        store.note(copy_distance=apart, size=size)
+    return np.asarray(extension.project(x))
+
+
+def _note_distance(extension: Composition, found: np.ndarray, outcome: Outcome) -> None:
+    """Note the largest distances of copies, beside the sizes of states, (..., 2); warn of large ones."""
+    apart, size, held = found[..., 0], found[..., 1], np.asarray(outcome.status) >= 0  # what has failed says more
+    ratio = np.where(apart == 0, 0.0, apart / np.where(size == 0, 1.0, size))
+    outcome.stats["copy_distance"] = largest = float(np.fmax.reduce(ratio, axis=None))
+    lost = (ratio > APART) & (held if ratio.ndim else held.all())
+    if lost.any():
+        which = "" if lost.ndim == 0 else f" of {np.count_nonzero(lost)} of {lost.size} trajectories"
+        warn(
+            f"The two copies{which} that method {extension.method!r} keeps differ by up to {largest:.3g} of the size "
+            "of the states: these say little about the system. Reduce `dt`, or change `omega`, the strength by which "
+            "the copies are bound.",
+            RuntimeWarning,
+        )
+
+
+# options -----------------------------------------------------------------------------------------
 
 
 def _check_parts(parts: Any) -> None:
@@ -460,9 +523,10 @@ def splitting_method(
     for argument, value, known in (("splitting", splitting, SPLITTINGS), ("clock", clock, CLOCKS)):
         check_one_of(argument, value, known)
     if name is None:
-        row = _row_of(table, splitting, clock)
-        if row is not None:
-            return method_of_row(row)
+        triple = (table.name, splitting, clock)
+        rows = [name for name, row in TRIPLES.items() if (row.scheme, row.splitting, row.clock) == triple]
+        if rows and SCHEMES.get(table.name) == table:
+            return method_of_row(rows[0])
         name = "_".join([table.name, *(part for part in (splitting, clock) if part not in ("kinetic", "physical"))])
     elif not isinstance(name, str):
         raise TypeError(f"`name` must be a string, such as 'my_method'; got {type(name).__name__}.")
@@ -470,14 +534,6 @@ def splitting_method(
         taken = "is a built-in method of another table" if name in NAMES else "is empty"
         raise ValueError(f"`name` {name!r} {taken}: choose another one, as by name='my_method'.")
     return _method_of(name, table, splitting, clock)
-
-
-def _row_of(scheme: Scheme, splitting: str, clock: str) -> str | None:
-    """Return the name of a triple in `TRIPLES`, if it is there."""
-    if SCHEMES.get(scheme.name) != scheme:
-        return None
-    triple = (scheme.name, splitting, clock)
-    return next((name for name, row in TRIPLES.items() if (row.scheme, row.splitting, row.clock) == triple), None)
 
 
 @cache

@@ -60,12 +60,7 @@ class ArraySteps:
 
 
 class Stepper:
-    """One run of a fixed-step integrator: all that a run changes or counts is here, its kernel and its arrays.
-
-    `kernel` are its compiled loops, None where it is made of array operations; `arrays` the same steps by these.
-    `saves_finite` is True if the states that `rollout` saves up to the last finite one are known to be finite. `remark`
-    says why a run of a formula is not compiled, for its message; `why` why functions of Python run as such.
-    """
+    """One run of a fixed-step integrator: all that a run changes or counts is here, its kernel and its arrays."""
 
     def __init__(
         self,
@@ -77,8 +72,8 @@ class Stepper:
     ) -> None:
         self.integrator, self.system, self.problem = integrator, problem.system, problem
         self.arrays, self.kernel = arrays, kernel
-        self.saves_finite = kernel is not None and kernel.saves_finite
-        self.remark = self.why = ""
+        self.saves_finite = kernel is not None and kernel.saves_finite  # of saved states up to the last finite one
+        self.remark = self.why = ""  # the reasons why a formula is not compiled, and functions of Python run as such
         y0, untraced = problem.y0, None if kernel is not None or problem.system is None else problem.system.untraced
         if untraced and problem.backend == "auto" and y0.dtype == np.float64:
             name = "potential" if problem.system.separable else "hamiltonian"
@@ -162,9 +157,18 @@ class Stepper:
         known = arrays.counts if self.kernel is None else self.kernel.evaluations(n_steps, n_saved, n_extra)
         return arrays.evaluations(n_steps, n_saved, n_extra, self.backend) if known is None else dict(known)
 
-    def more_stats(self) -> dict[str, int]:
-        """Further entries of the statistics."""
-        return {"newton_iterations": self.arrays.iterations} if self.arrays.stages else {}
+
+def stepper_of(
+    integrator: Any, problem: Problem, arrays: ArraySteps, make: Callable[..., Any], compensated: bool = False
+) -> Stepper:
+    """Return the stepper of the loops that `make` gives, for names of parameters where gradients flow to these."""
+    if problem.followed:
+        return Stepper(integrator, problem, arrays, _followed_loops(make, problem))
+    told: list[str] = []
+    kernel = compiled_loops(make, problem.y0, problem.backend, compensated, told, problem.system)
+    if problem.parameter_values is not None:
+        kernel = kernel.varied(problem.parameter_values)
+    return Stepper(integrator, problem, arrays, kernel, told)
 
 
 def compiled_loops(
@@ -172,14 +176,11 @@ def compiled_loops(
     y0: Array,
     backend: str,
     compensated: bool = False,
-    reason: str | None = None,
     told: list[str] | None = None,
     system: Any = None,
 ) -> Any:
-    """Return the compiled loops that `make` gives, or None where the call needs, or asks for, array operations.
-
-    Tensors need these, but where the `system` is given: there those on the CPU are compiled.
-    """
+    """Return the compiled loops that `make` gives, or None where the call needs, or asks for, array operations."""
+    reason = None
     if backend == "array":
         reason = "`backend` is 'array': choose 'auto'."
     elif is_tensor(y0):
@@ -205,7 +206,7 @@ def compiled_loops(
     return None
 
 
-def followed_loops(make: Callable[[tuple[str, ...]], Any], problem: Problem) -> Any:
+def _followed_loops(make: Callable[[tuple[str, ...]], Any], problem: Problem) -> Any:
     """The compiled loops, that `make` gives for names, of a run through which gradients flow to parameters."""
     names, array = tuple(problem.followed), problem.backend == "array"
     try:
@@ -286,7 +287,7 @@ def checked_state(y_next: Any, y: Array) -> Array:
     """Return the result of a step from y, checked to be of the same kind, shape and dtype: it may be a plug-in's."""
     shape = getattr(y_next, "shape", None)
     if shape == y.shape and y_next.dtype == y.dtype:
-        if is_tensor(y) and y.requires_grad and not y_next.requires_grad and _gradients_are_on():
+        if is_tensor(y) and differentiable(y) and not (y_next.requires_grad or transformed(y)):
             raise TypeError(
                 "`step` loses the gradient of the tensors that it is given: pass NumPy arrays, or y0.detach(). A class "
                 "whose step takes arrays only says so by `arrays_only`."
@@ -297,12 +298,6 @@ def checked_state(y_next: Any, y: Array) -> Array:
         f"`step` must return states as those that it is given, of {y.dtype} and shape {tuple(y.shape)}; got "
         f"{type(y_next).__name__}{what}. Mend the integrator: check_integrator tests it."
     )
-
-
-def _gradients_are_on() -> bool:
-    import torch
-
-    return torch.is_grad_enabled()
 
 
 def shorter_steps(stepper: Stepper, grid: Grid, y: Array, count: np.ndarray, remainder: np.ndarray) -> Array:

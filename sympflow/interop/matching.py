@@ -38,7 +38,7 @@ class Comparison:
 
     def __init__(self, argument: str, integrator: FixedStep, system: HamiltonianSystem | None, remedy: str) -> None:
         self.argument, self.integrator, self.system, self.remedy = argument, integrator, system, remedy
-        self.flow = integrator.given_flow if system is None else integrator.flow_for(system)
+        self.flow: Any = integrator.given_flow if system is None else integrator.flow_for(system)
         self.states_compared, self.known = 0, False
         self._given: Any = None
         self._next, self._gap = FIRST_LOOK, FIRST_LOOK
@@ -137,7 +137,6 @@ class Comparison:
         """States of the domain (n, 2d), n = 0 without one."""
         system = self.system
         if system is None:
-            assert self.flow is not None
             ground = self._ground()
             return _drawn(ground if ground is self.flow.domain else None, 2 * self.flow.ndof)
         if system not in _WITHIN:
@@ -146,7 +145,6 @@ class Comparison:
 
     def _ground(self) -> Domain | None:
         """The domain of a flow that was given alone, or a box about it, if its H is not known."""
-        assert self.flow is not None
         domain = self.flow.domain
         return domain.box if isinstance(domain, EnergySublevel) and domain.hamiltonian is None else domain
 
@@ -176,18 +174,15 @@ class Comparison:
             return
         i = int(np.argmin(agree))
         looked = t0 is not None and t0 != times[i] and self.system.autonomous
-        before = _quietly(fun, t0, y) if looked and t0 is not None else None
-        if before is not None:
+        if looked and t0 is not None and (before := _quietly(fun, t0, y)) is not None:
             before = before.reshape(-1, width)[:MOST_ROWS]
             if _agree(before, velocity)[i]:
-                assert t0 is not None
                 self._refuse_time(t0, times[i], states[i], before[i], slope[i])
         self._refuse(times[i], states[i], slope[i], velocity[i])
 
     def _close_to_flow(self, times: np.ndarray, states: np.ndarray, slope: np.ndarray) -> None:
         import torch
 
-        assert self.flow is not None
         states = states.astype(float)
         if (ground := self._ground()) is not None:  # elsewhere it was trained for nothing
             inside = np.asarray(ground.contains(states))

@@ -50,7 +50,8 @@ class Path:
         self.driven = system is not None and not system.autonomous
         self.start = t0.to(torch.float64)
         self.t0: Any = 0.0 if not self.driven else self.start if differentiable(t0) else float(t0)
-        self.eager = self._learns() or differentiable(self.t0)
+        learns = system is not None and system.definition.learns(y0)  # True if torch follows numbers of H
+        self.eager = learns or differentiable(*self.weights(), self.t0)
 
     def __call__(self, s: Tensor) -> Tensor:
         """ψ_s(y0), (n, ..., 2d), for elapsed times s (n,), each 0 or with the sign of the direction."""
@@ -134,12 +135,6 @@ class Path:
     def _plain(self, y: Tensor) -> bool:
         """True if NumPy may step y: on the CPU, and with nothing that torch follows, of the state or of weights."""
         return not (self.eager or differentiable(y)) and y.device.type == "cpu"
-
-    def _learns(self) -> bool:
-        """True if torch follows numbers of the map: the weights of the flow, or those of H."""
-        if differentiable(*self.weights()):
-            return True
-        return self.system is not None and self.system.definition.learns(self.y0)
 
     def weights(self) -> list[Tensor]:
         """The weights of the flow, if there is one."""
@@ -375,24 +370,6 @@ class _PulledBack(torch.autograd.Function):
                     of_s[i] = of_lengths.sum()
         times = (of_s.to(ctx.dtype) if ctx.needs_input_grad[1] else None, of_start if ctx.needs_input_grad[2] else None)
         return None, *times, a, *of_parameters
-
-
-def leaves(system: HamiltonianSystem, y: Tensor, t: float) -> list[Tensor]:
-    """The leaves of the graph on which the vector field at y and t depends, other than y: a network's weights."""
-    y = y.detach()
-    if not system.definition.learns(y):
-        return []
-    found: list[Tensor] = []
-    waiting, seen = [system.vector_field(y, t).grad_fn], set()
-    while waiting:
-        node = waiting.pop()
-        if node is None or node in seen:
-            continue
-        seen.add(node)
-        if isinstance(leaf := getattr(node, "variable", None), Tensor):
-            found.append(leaf)
-        waiting += [parent for parent, _ in node.next_functions]
-    return found
 
 
 def _places(saved: np.ndarray, count: Tensor) -> Tensor:

@@ -131,7 +131,6 @@ class Reading:
     def test(self, theta: np.ndarray, states: np.ndarray, scales: np.ndarray) -> tuple[float, float]:
         """LᵀJ + JL over twice JL, 0 for any H, at states (2d, n) in the order of the reading; the rate of volumes."""
         slopes = self.field.field(theta, states, True, False).slope
-        assert slopes is not None
         back = np.argsort(self.rows)
         slopes = slopes[np.ix_(back, back)]
         d = len(scales) // 2
@@ -282,7 +281,6 @@ def fields_of_drive(drive: Drive, smooth: Smooth) -> np.ndarray:
     """The fields (n, 2d, k) of the terms of a drive at the points of curves."""
     d = smooth.points.shape[1] // 2
     by = drive.at(smooth.times).gradient(np.zeros(drive.n), smooth.points.T[:d], False, True).by_parameters
-    assert by is not None
     forces = np.moveaxis(-by[:, :-1], -1, 0)
     return np.concatenate([np.zeros_like(forces), forces], axis=1)
 
@@ -332,9 +330,10 @@ def drive_frequency(X: np.ndarray, smooth: Smooth, scales: np.ndarray, drive: Dr
     most = min(int(2 * smooth.longest / smooth.step), FREQUENCIES)
     frequencies = np.pi / smooth.longest * np.arange(0.5, max(most, 2) / 2, 0.25)
     beside = Rest.of(X, smooth.slopes, scales)
-    pushes = drive.base.gradient(np.zeros(drive.base.n), smooth.points.T[:d], False, True).by_parameters
-    assert pushes is not None
-    pushes = pushes / scales[d:, None, None]
+    pushes = (
+        drive.base.gradient(np.zeros(drive.base.n), smooth.points.T[:d], False, True).by_parameters
+        / scales[d:, None, None]
+    )
     terms = np.einsum("ikn,ni->nk", pushes, beside.left.reshape(len(X), -1)[:, d:])
     power = np.abs(np.exp(-1j * frequencies[:, None] * smooth.times) @ terms) ** 2 / (pushes**2).sum(axis=(0, 2))
 

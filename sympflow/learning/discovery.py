@@ -216,7 +216,7 @@ class Discovery:
         parts: list[str] = []
         for f, c, error in zip(self.terms, self.coefficients, self.errors, strict=True):
             sign = "- " if c < 0 else "+ " if parts else ""
-            parts.append(f"{sign}{rounded(abs(c), error)}*{_in_product(f)}")
+            parts.append(f"{sign}{rounded(abs(c), error)}*{f'({f})' if f.is_Add else f}")
         return " ".join(parts)
 
     def table(self) -> str:
@@ -722,20 +722,9 @@ class _Search:
         remark = remark_on(same) if same else self._too_loud(noise) if explains else self._remark(noise, excess)
         if self.session.cut:
             remark = f"{remark} The time budget, or Ctrl-C, ended the search: give it more.".strip()
-        order = np.argsort([str(self.library.expressions[k]) for k in chosen])
-        return Discovery(
-            tuple(self.library.expressions[chosen[i]] for i in order),
-            fit.theta[order],
-            np.sqrt(np.diag(fit.covariance()))[order],
-            noise,
-            self.expected,
-            explains,
-            remark,
-            models,
-            self.library.expressions,
-            self.superfluous,
-            same,
-        )
+        found = self.library.subset(chosen).expressions, fit.theta, np.sqrt(np.diag(fit.covariance()))
+        library = self.library.expressions, self.superfluous
+        return _in_order(*found, noise, self.expected, explains, remark, models, *library, same)
 
     def _unseen(self, chosen: list[int], fit: Fit) -> tuple[sp.Expr, ...]:
         """Functions that are the same along all orbits: of q alone and of p alone where H is separable."""
@@ -803,13 +792,15 @@ class _Search:
         )
 
 
+def _in_order(terms: tuple[sp.Expr, ...], theta: Any, errors: Any, *more: Any) -> Discovery:
+    """The record with its terms in the order of their names."""
+    order = np.argsort([str(f) for f in terms])
+    return Discovery(tuple(terms[i] for i in order), np.array(theta)[order], np.array(errors)[order], *more)
+
+
 def _residual(cost: float, freedom: int) -> float:
     """The root mean square of the residuals over the noise."""
     return math.sqrt(cost / max(freedom, 1))
-
-
-def _in_product(f: sp.Expr) -> str:
-    return f"({f})" if f.is_Add else str(f)
 
 
 def rounded(value: float, error: float) -> str:
@@ -846,36 +837,23 @@ def _of_flow(
     path = regression.nested(regression.forward(most_terms))
     misfits = [regression.misfit(active) for active in path]
     chosen = max((i for i in range(1, len(path)) if misfits[i - 1] > OF_A_FLOW * misfits[i]), default=len(path) - 1)
-    models = tuple(
-        Model(
-            library.subset(active).expressions,
-            tuple(regression.coefficients(active).tolist()),
-            tuple(regression.errors(active).tolist()),
-            r / max(misfits[chosen], 1e-300),
-            regression.criterion(active),
-        )
-        for active, r in zip(path, misfits, strict=True)
-    )
+
+    def model(active: list[int], misfit: float) -> Model:
+        theta, errors = regression.coefficients(active).tolist(), regression.errors(active).tolist()
+        found, residual = library.subset(active).expressions, misfit / max(misfits[chosen], 1e-300)
+        return Model(found, tuple(theta), tuple(errors), residual, regression.criterion(active))
+
+    models = tuple(map(model, path, misfits))
     best = models[chosen]
-    order = np.argsort([str(f) for f in best.terms])
     spread = float(np.std(values))
     explains = misfits[chosen] < 0.05 * spread
     remark = "" if explains else (
         f"No sparse sum of the library's {len(library)} terms is the flow's Hamiltonian: {misfits[chosen]:.3g} is left "
         f"of its spread {spread:.3g}. Give other `terms`, or a smaller `domain`."
     )  # fmt: skip
-    discovery = Discovery(
-        tuple(best.terms[i] for i in order),
-        np.array(best.coefficients)[order],
-        np.array(best.errors)[order],
-        np.array([misfits[chosen]]),
-        np.zeros(1),
-        explains,
-        remark,
-        models,
-        library.expressions,
-        superfluous,
-    )
+    noise = np.array([misfits[chosen]]), np.zeros(1)
+    more = explains, remark, models, library.expressions, superfluous
+    discovery = _in_order(best.terms, best.coefficients, best.errors, *noise, *more)
     system = _system(discovery, flow.ndof, name=name, domain=found, y0=x[0], dt=flow.dt / 10)
     if not explains:
         warn(remark)

@@ -234,15 +234,9 @@ def _pairs(constraints: Constraints) -> Iterator[Candidate]:
 
 
 def _flows(constraints: Constraints) -> Iterator[Candidate]:
-    scaling, mass = constraints.flow_scaling, constraints.inverse_mass is not None
-    if (
-        scaling is None
-        or constraints.force
-        or constraints.frequencies
-        or constraints.known
-        or mass
-        or constraints.angles
-    ):
+    scaling = constraints.flow_scaling
+    told = constraints.force or constraints.frequencies or constraints.known or constraints.angles
+    if scaling is None or told or constraints.inverse_mass is not None:
         return
     for pairs, width, palindromic in FLOW_SIZES:
         kind, all_pairs = ("palindromic SympFlow", 2 * pairs) if palindromic else ("SympFlow", pairs)

@@ -7,14 +7,14 @@ observed they are the p of both equations. Where velocities are, L is known but 
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Self
 
 import numpy as np
 
 from sympflow.learning.models import Model
 from sympflow.learning.orbits import integrals
-from sympflow.learning.parts import Network, Part, Polynomial
+from sympflow.learning.parts import Network, Polynomial
 from sympflow.learning.reading import Run
 from sympflow.learning.trajectories import Trajectories
 
@@ -36,7 +36,9 @@ def lagrangian_start(model: Model, data: Trajectories, theta: np.ndarray) -> tup
 
     if data.velocities and all(part.of == "q" or not part.n for part in model.parts):  # the masses are known
         return theta, with_momenta([model.states(theta, run.y) for run in runs])
-    equations = Equations.of(replace(model, parts=tuple(map(_linear, model.parts))), data)
+    polynomial = partial(Polynomial.up_to, DEGREE)  # in place of a network
+    parts = (polynomial(part.of, part.scales) if isinstance(part, Network) else part for part in model.parts)
+    equations = Equations.of(replace(model, parts=tuple(parts)), data)
     found, *_ = equations.solved()
     if not data.velocities:
         return found, data
@@ -53,11 +55,6 @@ def told(model: Model, data: Trajectories) -> tuple[np.ndarray, np.ndarray]:
     theta, left, J = Equations.of(model, data).solved()
     variance = CORRELATED * (left @ left) / max(len(left) - len(theta), 1)
     return theta, J.T @ J / max(float(variance), np.finfo(float).tiny)
-
-
-def _linear(part: Part) -> Part:
-    """A polynomial in place of a network."""
-    return Polynomial.up_to(DEGREE, part.of, part.scales) if isinstance(part, Network) else part
 
 
 class Equations:

@@ -236,7 +236,10 @@ def _constraints(data: Trajectories, separable: Any, mass: Any, damping: Any, pe
     middle = np.nanmean(np.concatenate([run.y[:d] for run in data.runs], axis=1), axis=1)
     of_data: dict[str, Any] = {"momenta": momenta, "velocities": data.velocities, "middle": middle}
     of_data["angles_known"] = period is not None
-    return Constraints(data.scales, separable, inverse, DAMPINGS[damping], _periods(period, d), parts, **of_data)
+    periods = np.full(2 * d, np.inf)
+    if period is not None:
+        periods[:d] = periods_of(period, d)
+    return Constraints(data.scales, separable, inverse, DAMPINGS[damping], periods, parts, **of_data)
 
 
 def _covariance(data: Trajectories) -> np.ndarray:
@@ -244,14 +247,6 @@ def _covariance(data: Trajectories) -> np.ndarray:
     p = [run.y[data.ndof :, np.isfinite(run.y).all(axis=0)] for run in data.runs]
     rest = np.concatenate([one - one.mean(axis=1, keepdims=True) for one in p if one.size], axis=1)
     return rest @ rest.T / max(rest.shape[1], 1)
-
-
-def _periods(period: Any, d: int) -> np.ndarray:
-    """The period of each coordinate (2d,), infinite where there is none."""
-    periods = np.full(2 * d, np.inf)
-    if period is not None:
-        periods[:d] = periods_of(period, d)
-    return periods
 
 
 def _formulas(known: Any, d: int) -> tuple[Fixed, ...]:

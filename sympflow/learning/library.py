@@ -38,10 +38,7 @@ def coordinates_of(part: str, ndof: int) -> Coordinates:
 
 
 def polynomials(ndof: int, degree: int = 4) -> list[sp.Expr]:
-    """All products of powers up to a degree; of three or more degrees of freedom those of one, and pairs.
-
-    Pairs (i, j) have p_i p_j, q_i p_j and powers of q_i − q_j, by which q_i q_j can be written.
-    """
+    """All products of powers up to a degree; of three or more degrees of freedom those of one, and of pairs."""
     q, p = coordinates(ndof)
     sets = [(*q, *p)] if ndof <= MOST_PRODUCTS else list(zip(q, p, strict=True))
     terms = [
@@ -162,7 +159,7 @@ class Terms(Sum):
         self.of, self.library, self.n = of, library, len(library)
 
     @cached_property
-    def quadratic(self) -> bool:
+    def quadratic(self) -> bool:  # type: ignore[override]
         return all(term.quadratic for term in self.library.terms)
 
     @property

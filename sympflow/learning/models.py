@@ -142,40 +142,37 @@ class Model(VectorField):
         """∇ of the sum of the parts of q alone, or of p alone, or of all of H."""
         m, N = x.shape
         chosen = [(part, place) for part, place in zip(self.parts, self.places, strict=True) if of in (part.of, "y")]
-        columns = np.zeros((m, self.n, N)) if by_parameters else None
+        columns: Any = np.zeros((m, self.n, N)) if by_parameters else None
         if len(chosen) == 1 and chosen[0][0].of == of:
             part, place = chosen[0]
             found = part.gradient(theta[place], x, slope, by_parameters)
-            if columns is not None and found.by_parameters is not None:
+            if by_parameters:
                 columns[:, place] = found.by_parameters
             return Linear(found.value, found.slope, columns)
         value = np.zeros((m, N))
-        slopes = np.zeros((m, m, N)) if slope else None
+        slopes: Any = np.zeros((m, m, N)) if slope else None
         for part, place in chosen:
             rows = self._columns(part.of) if of == "y" else slice(None)
             found = part.gradient(theta[place], x[rows], slope, by_parameters)
             value[rows] += found.value
-            if slopes is not None and found.slope is not None:
+            if slope:
                 slopes[rows, rows] += found.slope
-            if columns is not None and found.by_parameters is not None:
+            if by_parameters:
                 columns[rows, place] += found.by_parameters
         return Linear(value, slopes, columns)
 
     def field(self, theta: np.ndarray, y: np.ndarray, slope: bool, by_parameters: bool) -> Linear:
         """The vector field."""
         d = self.ndof
-        value, slopes, columns = (
-            None if a is None else np.concatenate([a[d:], -a[:d]])
-            for a in self.gradient(theta, y, "y", slope, by_parameters)
-        )
-        assert value is not None
+        found: Any = self.gradient(theta, y, "y", slope, by_parameters)
+        value, slopes, columns = (None if a is None else np.concatenate([a[d:], -a[:d]]) for a in found)
         if self.force is not None:
             (fields, bent), factors = self.force(y), theta[-self.forces :]
             value = value + np.einsum("mkn,k->mn", fields, factors)
             slopes = None if slopes is None else slopes + np.einsum("mkjn,k->mjn", bent, factors)
             if columns is not None:
                 columns[:, -self.forces :] = fields
-        return Linear(value, slopes, columns)
+        return Linear(value, slopes, columns)  # type: ignore[arg-type]
 
     def observed(self, theta: np.ndarray, x: np.ndarray, X: np.ndarray | None) -> tuple[np.ndarray, Any]:
         if not self.velocities:
@@ -185,7 +182,6 @@ class Model(VectorField):
         seen = np.concatenate([x[:d], f.value[:d]])
         if X is None:
             return seen, None
-        assert f.slope is not None
         moved = np.einsum("ijn,jcn->icn", f.slope[:d], X)
         if f.by_parameters is not None:
             moved[:, 2 * d :] += f.by_parameters[:d]
@@ -197,7 +193,6 @@ class Model(VectorField):
         d, x = self.ndof, y.copy()
         for _ in range(1 if all(part.quadratic or part.of == "q" or part.inertial for part in self.parts) else NEWTON):
             f = self.field(theta, x, True, False)
-            assert f.slope is not None
             by_p = np.moveaxis(np.broadcast_to(f.slope[:d, d:], (d, d, x.shape[1])), -1, 0)
             x[d:] += np.linalg.solve(by_p, (y[d:] - f.value[:d]).T[..., None])[..., 0].T
         return x

@@ -72,7 +72,6 @@ class Splitting(Stepper):
     def step(
         self, model: Field, theta: np.ndarray, x: np.ndarray, X: np.ndarray | None, h: np.ndarray, t: np.ndarray
     ) -> Any:
-        assert isinstance(model, Model)
         d = model.ndof
         q, p = slice(0, d), slice(d, 2 * d)
         wanted = X is not None, X is not None and X.shape[1] > 2 * d
@@ -150,7 +149,6 @@ class Gauss(Stepper):
         inner = x[:, None] + h * np.einsum("ij,mjn->min", A, K)
         c = X.shape[1]
         f = model.field(theta, inner.reshape(m, s * N), True, c > m)
-        assert f.slope is not None
         S = np.broadcast_to(f.slope, (m, m, s * N)).reshape(m, m, s, N)
         rhs = np.einsum("klin,lcn->nikc", S, X, optimize=True)
         if f.by_parameters is not None:

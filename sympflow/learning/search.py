@@ -317,7 +317,7 @@ class Search:
         worse, best = 0, None
         for candidate in candidates:
             over = self.best is not None and (self.best[2].exact or setting.stop())
-            if over or worse == 2 or not self._affords(candidate):
+            if over or worse == 2 or self.numbers <= candidate.model.n:
                 return
             made = self._try(candidate, setting, session)
             better = best is None or fitting.gains(best[2], made[2])
@@ -332,10 +332,6 @@ class Search:
                 break
             found = fewer
         return [candidate] if found is candidate else [found, candidate]
-
-    def _affords(self, candidate: Candidate) -> bool:
-        """True if there are more numbers than the model and the initial states have."""
-        return self.numbers > candidate.model.n
 
     def _fit(self, candidate: Candidate, setting: Setting, session: Session) -> Chosen:
         numbers = self.done.get(candidate.name)
@@ -396,13 +392,7 @@ class Search:
             checkpoints.write(session.checkpoint, self.identity | state)
 
     def resume(self, path: Path) -> None:
-        """Take over the models that were fitted before a run was ended.
-
-        Raises
-        ------
-        ValueError
-            If the file is not a checkpoint, or one of other trajectories or options.
-        """
+        """Take over the models of a checkpoint; a ValueError if it is one of other trajectories or options."""
         self.done = checkpoints.read_same(path, self.identity)["optimizer"]
 
     def diagnose(self, session: Session) -> None:
@@ -574,16 +564,11 @@ class Search:
             top = float(energies.max())
             domain = EnergySublevel(top + MARGIN * (top - float(energies.min())), domain)
         rates, drag = found.theta[model.n - model.forces :], model.force is drags
-        system = HamiltonianSystem.from_sympy(
-            model.expression(found.theta),
-            damping=None if drag or not model.forces else float(rates[0]) if len(rates) == 1 else rates,
-            name=name,
-            domain=domain,
-            y0=states[0],
-            t_span=(start, start + max(run.span for run in self.data.runs)),
-            dt=self.data.time_scale,
-            **options,
-        )
+        if model.forces and not drag:
+            options["damping"] = float(rates[0]) if len(rates) == 1 else rates
+        t_span = start, start + max(run.span for run in self.data.runs)
+        options |= {"name": name, "domain": domain, "y0": states[0], "t_span": t_span, "dt": self.data.time_scale}
+        system = HamiltonianSystem.from_sympy(model.expression(found.theta), **options)
         return doubled(system, self._drag, name=name) if drag else system
 
     @property

@@ -489,7 +489,6 @@ def _increments(
     """The increments less the integrals of the field, and minus their derivative by θ."""
     here = model.at(np.concatenate([run.t for run in pieces]))
     f = here.field(theta, np.concatenate([run.y for run in pieces], axis=1), False, True)
-    assert f.by_parameters is not None
     at, rests, columns = 0, [], []
     for run in pieces:
         here = slice(at, at + run.n_points)

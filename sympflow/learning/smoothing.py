@@ -59,7 +59,8 @@ def smoothed(runs: Sequence[Run], velocities: bool) -> Smooth:
     known = np.isfinite(points).all(1) & np.isfinite(slopes).all(1)
     noise = np.concatenate([_roughness(run) for run in given], axis=1)
     noise[np.isnan(noise).all(axis=1)] = 0.0
-    sigma = np.zeros(len(noise)) if noise.shape[1] == 0 else np.sqrt(_middle(noise))
+    # the median of means of two squared normal numbers is ln 2 of the mean
+    sigma = np.zeros(len(noise)) if noise.shape[1] == 0 else np.sqrt(np.nanmedian(noise, axis=1) / np.log(2))
     step = float(np.median(np.concatenate([np.diff(run.t) for run in runs])))
     return Smooth(states, rates, points[known], slopes[known], times[known], owner[known], sigma, step)
 
@@ -131,8 +132,3 @@ def _roughness(run: Run) -> np.ndarray:
         rest = y - (y @ basis) @ basis.T
         left.append((rest**2).sum(1) / (WINDOW - DEGREE - 1))
     return np.array(left).T
-
-
-def _middle(squares: np.ndarray) -> np.ndarray:
-    """The variance of the noise, by the median of means of two squared normal numbers: that is ln 2 of the mean."""
-    return np.nanmedian(squares, axis=1) / np.log(2)

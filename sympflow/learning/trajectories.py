@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from sympflow.arguments import MAX_ASKED_VALUES, checked_count, floats, plain, warn
 from sympflow.flow.scaling import Scaling
 from sympflow.learning import reading
-from sympflow.learning.reading import OBSERVED, Found, Run
+from sympflow.learning.reading import OBSERVED, Run
 from sympflow.learning.smoothing import Smooth, smoothed
 from sympflow.show.cards import Card, Shown
 from sympflow.show.pictures import MOST_LINES, trajectory_figure
@@ -137,7 +137,7 @@ class Trajectories(Shown):
         given: dict[str, Any] = {"order": order, "time": time, "run": run, "q": q, "p": p, "observed": observed}
         converted: dict[str, Any] = {"units": units, "velocity_mass": velocity_mass, "period": period}
         if isinstance(data, Trajectories):
-            found, names = list(_labelled(data.runs)), data.names
+            found, names = [(f"trajectory {i}", run.t, run.y) for i, run in enumerate(data.runs)], data.names
             observed = "qv" if data.velocities else observed
         elif isinstance(data, Mapping) and not _is_a("xarray", "Dataset", data):
             return cls.read(reading.of_mapping(data, ndof, time, q, p, observed), ndof, **given, **converted)
@@ -149,7 +149,11 @@ class Trajectories(Shown):
             order = "halves"
         elif isinstance(data, str | Path):
             return cls.read(reading.opened(Path(data)), ndof, **given, **converted)
-        elif isinstance(data, list | tuple) and data and all(map(_is_named, data)):
+        elif (
+            isinstance(data, list | tuple)
+            and data
+            and all(isinstance(one, Mapping) or _is_a("pandas", "DataFrame", one) for one in data)
+        ):
             if not any(np.ndim(value) for one in data for value in dict(one).values()):  # a row each
                 return cls.read(imported("pandas", "Reading rows").DataFrame(data), ndof, **given, **converted)
             parts = [cls.read(one, ndof, **given, **converted) for one in data]
@@ -410,16 +414,6 @@ def _cut(run: Run, points: int, span: float) -> Iterator[Run]:
             stop = n
         yield run.part(start, stop)
         start = stop
-
-
-def _labelled(runs: Sequence[Run]) -> Iterator[Found]:
-    for i, run in enumerate(runs):
-        yield f"trajectory {i}", run.t, run.y
-
-
-def _is_named(data: Any) -> bool:
-    """True of a dictionary, a table or a Dataset."""
-    return isinstance(data, Mapping) or _is_a("pandas", "DataFrame", data)
 
 
 def _is_a(library: str, kind: str, data: Any) -> bool:

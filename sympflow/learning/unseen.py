@@ -49,9 +49,7 @@ def _same(
         values = np.stack([part.value(unit, at - middle[:, None]) for unit in units])
         return np.cov(values).reshape(part.n, part.n)
 
-    slopes = part.gradient(np.zeros(part.n), x - middle[:, None], False, True).by_parameters
-    assert slopes is not None
-    slopes = slopes * errors[:, None, None]
+    slopes = part.gradient(np.zeros(part.n), x - middle[:, None], False, True).by_parameters * errors[:, None, None]
     chance = CHANCE * np.einsum("ikn,iln->kl", slopes, slopes, optimize=True) / x.shape[1]
     shares, vectors = scipy.linalg.eigh(covariance(x) - chance, covariance(box))
     same = vectors[:, shares < SAME].T

@@ -159,7 +159,7 @@ def _states(solution: Any, system: HamiltonianSystem | None) -> tuple[np.ndarray
 def _frame(system: HamiltonianSystem) -> Frame:
     if not isinstance(system, HamiltonianSystem):
         raise TypeError(f"`system` must be a HamiltonianSystem; got {type(system).__name__}.")
-    frame = frame_of(system.local, system.y0)
+    frame = frame_of(system)
     if frame is None:
         raise ValueError(
             f"`system` {system.name!r} has no planets about a star, whose elements these are: make it by "

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -11,9 +11,6 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.lazy import kept
 from sympflow.solution import Solution, check_solution, gathered
 from sympflow.solver import solve
-
-if TYPE_CHECKING:
-    import sympy
 
 __all__ = ["energy_balance_error"]
 
@@ -67,7 +64,8 @@ def energy_balance_error(sol: Solution, relative: bool = False) -> np.ndarray:
         return gathered(sol, lambda part: energy_balance_error(part, relative))
     with np.errstate(all="ignore"):
         H, work = _balanced(sol)
-        error = np.abs((H - _start_energy(sol)[..., None]) - work)
+        start = np.asarray(sol.system.hamiltonian(to_numpy(sol.y0).astype(float), sol.t_span[0]))
+        error = np.abs((H - start[..., None]) - work)
         if relative:
             error = error / (sol.system.energy_scale or np.nanmax(np.abs(H), axis=-1, keepdims=True))
     return np.where(np.isnan(error) & np.isfinite(H), np.inf, error)
@@ -81,11 +79,6 @@ def kept_by(system: HamiltonianSystem) -> str:
     return "balance" if system.conservative and not jumps else ""
 
 
-def _start_energy(sol: Solution) -> np.ndarray:
-    y0 = to_numpy(sol.y0).astype(float)
-    return np.asarray(sol.system.hamiltonian(y0, sol.t_span[0]))
-
-
 def _balanced(sol: Solution) -> tuple[np.ndarray, np.ndarray]:
     """H and ∫ ∂H/∂t dt at the outputs, (..., n) each."""
     system = sol.system
@@ -93,7 +86,7 @@ def _balanced(sol: Solution) -> tuple[np.ndarray, np.ndarray]:
     H = np.asarray(system.hamiltonian(y, np.broadcast_to(sol.t, y.shape[:-1])))
     if system.keeps_energy:
         return H, np.zeros(H.shape)
-    extended = extended_system(system)
+    extended = None if system.definition.may_jump else extended_system(system)  # whose steps meet no kinks
     integrator = None if extended is None else sol.integrator.on_extended(system, extended)
     if extended is None or integrator is None:
         return H, _quadrature(sol)
@@ -115,22 +108,13 @@ def extended_system(system: HamiltonianSystem) -> HamiltonianSystem | None:
     symbols = system.symbols
     if symbols is None or symbols.samples or system.kinetic_timed:
         return None
-    d, time = system.ndof, symbols.time
-    s = _symbol(f"q{d + 1}", time)
+    d, time = system.ndof, cast(Any, symbols.time)
+    s = type(time)(f"q{d + 1}", real=True)  # SymPy's symbol
     H, values = symbols.written
-    return HamiltonianSystem.from_sympy(
-        H.xreplace({time: time + s}),
-        params={symbol.name: system.params[symbol.name] for symbol in values},
-        time=time,
-        name=f"{system.name} with the work of the drive",
-        y0=np.zeros(2 * d + 2),
-        t_span=system.t_span,
-        dt=system.dt,
-    )
-
-
-def _symbol(name: str, like: sympy.Symbol) -> sympy.Symbol:
-    return type(like)(name, real=True)
+    params = {symbol.name: system.params[symbol.name] for symbol in values}
+    scene: dict[str, Any] = {"y0": np.zeros(2 * d + 2), "t_span": system.t_span, "dt": system.dt}
+    scene["name"] = f"{system.name} with the work of the drive"
+    return HamiltonianSystem.from_sympy(H.xreplace({time: time + s}), params=params, time=time, **scene)
 
 
 def _quadrature(sol: Solution) -> np.ndarray:

@@ -43,7 +43,8 @@ TURNS = 1e-5  # imaginary part of an eigenvalue that is simple, whose rounding i
 NEWTON_STEPS = 50
 SCALES = (0.1, 1.0, 10.0, 100.0)  # of the states at which Hessians are compared, in units of y0
 
-Polynomial = Sequence[Any]  # coefficients, the constant one first
+series: Any = np.polynomial.polynomial  # of fractions and decimals, which its stubs do not know
+Polynomial = Any  # a sequence or an array of coefficients, the constant one first
 
 
 class Window(NamedTuple):
@@ -143,21 +144,23 @@ def _of_table(scheme: Scheme) -> LinearStability:
     with localcontext() as context:
         context.prec = DIGITS
         p = [Decimal(c.numerator) / Decimal(c.denominator) for c in exact]
-        turns = _positive_roots(_derivative(p))
+        turns = _positive_roots(series.polyder(p))
         points, values = [Decimal(0)], [Decimal(1)]
         resonances: list[Decimal] = []
         for x in turns:
-            value = _value(p, x)
+            value = series.polyval(x, p)
             if abs(abs(value) - 1) <= Decimal(ROUNDING * _sensitivity(scheme, float(x))):
                 value = Decimal(1).copy_sign(value)
                 resonances.append(x)
             points.append(x)
             values.append(value)
         last = points[-1] + 1
-        while len(p) > 1 and _value(p, last) * Decimal(1).copy_sign(p[-1]) <= 1:  # from the last extremum on monotone
+        while (
+            len(p) > 1 and series.polyval(last, p) * Decimal(1).copy_sign(p[-1]) <= 1
+        ):  # from the last extremum on monotone
             last *= 2
         points.append(last)
-        values.append(_value(p, last))
+        values.append(series.polyval(last, p))
         windows = _windows(p, points, values)
         inside = LinearStability(windows)
         return LinearStability(windows, tuple(z for x in resonances if not inside.window_of(z := math.sqrt(x))))
@@ -174,18 +177,14 @@ def _windows(p: Polynomial, points: list[Decimal], values: list[Decimal]) -> tup
             if start is None and (u - level) * level <= 0 < (v - level) * level:  # leaves through this level
                 start, peak = _crossing(p, level, a, b), abs(v)
             elif start is not None and (v - level) * level <= 0 < (u - level) * level:  # comes back
-                windows.append(_window(start, _crossing(p, level, a, b) if v != level else b, peak))
+                stop, growth = _crossing(p, level, a, b) if v != level else b, peak + (peak * peak - 1).sqrt()
+                windows.append(Window(math.sqrt(start), math.sqrt(stop), float(growth)))
                 start = None
         if start is not None:
             peak = max(peak, abs(v))
     if start is not None:
         windows.append(Window(math.sqrt(start), math.inf, math.inf))
     return tuple(windows)
-
-
-def _window(start: Decimal, stop: Decimal, peak: Decimal) -> Window:
-    growth = peak + (peak * peak - 1).sqrt()
-    return Window(math.sqrt(start), math.sqrt(stop), float(growth))
 
 
 # polynomials ----------------------------------------------------------------------------------------------------------
@@ -196,14 +195,15 @@ def half_trace(scheme: Scheme) -> tuple[Fraction, ...]:
 
     The rows of the matrix are those of q and hp, in which its entries are polynomials in x.
     """
-    q, p = [[Fraction(1)], [Fraction(0)]], [[Fraction(0)], [Fraction(1)]]
+    q: list[Polynomial] = [[Fraction(1)], [Fraction(0)]]
+    p: list[Polynomial] = [[Fraction(0)], [Fraction(1)]]
     for kind, b, g, c, *_ in scheme.substeps:
         if kind == "drift":
-            q = [_sum(mine, _product([Fraction(b)], other)) for mine, other in zip(q, p, strict=True)]
+            q = [series.polyadd(mine, series.polymul([Fraction(b)], other)) for mine, other in zip(q, p, strict=True)]
         else:  # a kick by −(b x − g x² + c x³) q
             kick = [Fraction(0), Fraction(-b), Fraction(g), Fraction(-c)]
-            p = [_sum(mine, _product(kick, other)) for mine, other in zip(p, q, strict=True)]
-    trace = [x / 2 for x in _sum(q[0], p[1])]
+            p = [series.polyadd(mine, series.polymul(kick, other)) for mine, other in zip(p, q, strict=True)]
+    trace = [x / 2 for x in series.polyadd(q[0], p[1])]
     while len(trace) > 1 and trace[-1] == 0:
         trace.pop()
     return tuple(trace)
@@ -228,32 +228,6 @@ def _sensitivity(scheme: Scheme, x: float) -> float:
     return 1.0 + sum(abs(float(np.trace(left @ change @ right))) / 2 for left, change, right in parts)
 
 
-def _sum(a: list[Fraction], b: list[Fraction]) -> list[Fraction]:
-    n = max(len(a), len(b))
-    zero = Fraction(0)
-    return [(a[i] if i < len(a) else zero) + (b[i] if i < len(b) else zero) for i in range(n)]
-
-
-def _product(a: list[Fraction], b: list[Fraction]) -> list[Fraction]:
-    out = [Fraction(0)] * (len(a) + len(b) - 1)
-    for i, x in enumerate(a):
-        for j, y in enumerate(b):
-            if x and y:
-                out[i + j] += x * y
-    return out
-
-
-def _derivative(p: Polynomial) -> list[Any]:
-    return [k * c for k, c in enumerate(p)][1:]
-
-
-def _value(p: Polynomial, x: Any) -> Any:
-    total = 0 * x
-    for c in reversed(p):
-        total = total * x + c
-    return total
-
-
 def _positive_roots(p: Polynomial) -> list[Decimal]:
     """The positive roots at which a polynomial changes its sign, in order: between those of its derivative."""
     p = list(p)
@@ -262,8 +236,8 @@ def _positive_roots(p: Polynomial) -> list[Decimal]:
     if len(p) < 2:
         return []
     bound = 1 + max(abs(c / p[-1]) for c in p[:-1])  # Cauchy's
-    points = [Decimal(0), *_positive_roots(_derivative(p)), bound]
-    values = [_value(p, x) for x in points]
+    points = [Decimal(0), *_positive_roots(series.polyder(p)), bound]
+    values = [series.polyval(x, p) for x in points]
     found = []
     for (a, b), (u, v) in zip(pairwise(points), pairwise(values), strict=True):
         if u * v < 0:
@@ -275,11 +249,11 @@ def _positive_roots(p: Polynomial) -> list[Decimal]:
 
 def _crossing(p: Polynomial, level: Decimal, a: Decimal, b: Decimal) -> Decimal:
     """The x between a and b where p, monotone there, passes a level, to half of the digits."""
-    rising = _value(p, b) > _value(p, a)
-    slope = _derivative(p)
+    rising = series.polyval(b, p) > series.polyval(a, p)
+    slope = series.polyder(p)
     x = (a + b) / 2
     while b - a > b * Decimal(10) ** (-DIGITS // 2):
-        off, steep = _value(p, x) - level, _value(slope, x)
+        off, steep = series.polyval(x, p) - level, series.polyval(x, slope)
         a, b = (a, x) if (off > 0) == rising else (x, b)
         newton = x - off / steep if steep else a
         if a < newton < b and abs(newton - x) <= b * Decimal(10) ** (-DIGITS // 2):

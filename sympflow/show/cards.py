@@ -117,21 +117,8 @@ def legible(text: str) -> str:
     return plain.encode(encoding, "replace").decode(encoding)
 
 
-SPELLED = {
-    "…": "...",
-    "µ": "u",
-    "±": "+-",
-    "─": "-",
-    "–": "-",
-    "—": "-",
-    "−": "-",
-    "×": "x",
-    "·": "*",
-    "∞": "inf",
-    "≤": "<=",
-    "≥": ">=",
-    "→": "->",
-}
+SPELLED = {"…": "...", "µ": "u", "±": "+-", "×": "x", "·": "*", "∞": "inf", "≤": "<=", "≥": ">=", "→": "->"}
+SPELLED |= dict.fromkeys("─–—−", "-")
 
 
 def _spelled(character: str) -> str:

@@ -28,21 +28,7 @@ def trajectory_figure(
     kinds: Sequence[str] = KINDS,
     marker: str = "",
 ) -> Figure:
-    """Panels of trajectories side by side.
-
-    Parameters
-    ----------
-    t : ndarray (n,) or (N, n)
-    y : ndarray (N, 2d, n)
-    energy_error : ndarray (N, n) or None
-        Relative; without it there is no panel "energy".
-    title : str
-    kinds : sequence of str
-        Of "orbit": q₁ against q₂, or q over t of one degree of freedom, or a map of all q of many; "phase": q₁ against
-        p₁; "energy": the energy error over t.
-    marker : str
-        Of points, where states are samples.
-    """
+    """Panels of trajectories y (N, 2d, n) at t, (n,) or (N, n), with a `marker` where states are samples."""
     unknown = [kind for kind in kinds if kind not in KINDS]
     if unknown or not kinds:
         raise ValueError(f"`kinds` must be some of {', '.join(map(repr, KINDS))}; got {list(kinds)!r}.")
@@ -85,15 +71,8 @@ def _orbit(ax: Axes, t: np.ndarray, y: np.ndarray, error: np.ndarray, marker: st
     else:
         q = y[0, :d]
         largest = float(np.nanmax(np.abs(q), initial=0.0)) or 1.0
-        shown = ax.pcolormesh(
-            t if t.ndim == 1 else t[0],
-            np.arange(1, d + 1),
-            q,
-            cmap="RdBu_r",
-            vmin=-largest,
-            vmax=largest,
-            rasterized=True,
-        )
+        times, sites = t if t.ndim == 1 else t[0], np.arange(1, d + 1)
+        shown = ax.pcolormesh(times, sites, q, cmap="RdBu_r", vmin=-largest, vmax=largest, rasterized=True)
         ax.figure.colorbar(shown, ax=ax, shrink=0.8).set_label("q", color=TEXT)
         dress(ax, "t", "coordinate")
 

@@ -30,29 +30,14 @@ CHUNK = 2**19  # numbers in a chunk of q and p together, about
 
 @dataclass
 class Place:
-    """The place that a run has reached.
-
-    Attributes
-    ----------
-    steps : int
-    running : ndarray
-        The running state of its loops: see `kernels.protocol.RunCheckpoint`.
-    finite : ndarray of int
-        The last finite step of each trajectory.
-    state : ndarray of shape (..., K)
-        The states after `steps` steps, of those that may be saved.
-    failed : ndarray of bool, shape (...)
-        True where an output within a step was not finite.
-    counts : dict
-        Numbers of outputs, of what was saved, and the statistics so far, as JSON.
-    """
+    """The place that a run has reached: steps, the running state of its loops, the last finite steps, and states."""
 
     steps: int
-    running: np.ndarray
-    finite: np.ndarray
-    state: np.ndarray
-    failed: np.ndarray
-    counts: dict[str, Any] = field(default_factory=dict)
+    running: np.ndarray  # the running state of its loops: see `kernels.protocol.RunCheckpoint`
+    finite: np.ndarray  # (…): the last finite step of each trajectory
+    state: np.ndarray  # (…, K): the states after `steps` steps, of those that may be saved
+    failed: np.ndarray  # (…): true where an output within a step was not finite
+    counts: dict[str, Any] = field(default_factory=dict)  # of outputs, of what was saved, and statistics, as JSON
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return the place as arrays."""
@@ -201,7 +186,7 @@ class RunStore:
 
     def _read(self, names: tuple[str, ...], batch: tuple[int, ...], first: int) -> np.ndarray:
         fields = self.store.fields
-        n, size = fields[TIME].shape[0], fields[TIME].chunks[0]  # type: ignore[index]
+        n, size = fields[TIME].shape[0], fields[TIME].chunks[0]
         width = () if names == (TIME,) else (sum(fields[name].shape[-2] for name in names),)
         whole = np.empty((*batch, *width, n - first), fields[names[0]].dtype)
         row = 0

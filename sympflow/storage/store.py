@@ -30,6 +30,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from itertools import product
 from math import prod
+from operator import attrgetter
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -55,16 +56,12 @@ class StoreError(OSError):
 
 @dataclass(frozen=True)
 class Field:
-    """An array of a store, of numbers or truth values; fields that share a dimension have the same length along it.
-
-    `chunks` is by default the whole array. `missing` is the number where nothing has been written, which a reader of
-    zarr may show as NaN; the default is NaN, or 0 of other numbers than floats.
-    """
+    """An array of a store; `chunks` is by default all of it, `missing` the number where nothing was written."""
 
     dims: tuple[str, ...]
     shape: tuple[int, ...]
     dtype: Any = float
-    chunks: tuple[int, ...] | None = None
+    chunks: Any = None  # of int, one for each dimension; None for the whole array
     attributes: Mapping[str, Any] = field(default_factory=dict)
     missing: int | None = None
 
@@ -82,19 +79,12 @@ class Field:
     @property
     def grid(self) -> tuple[int, ...]:
         """The number of chunks along each dimension."""
-        assert self.chunks is not None
         return tuple(-(-n // size) for n, size in zip(self.shape, self.chunks, strict=True))
 
     def region(self, index: tuple[int, ...]) -> tuple[slice, ...]:
         """Return where in the array a chunk lies."""
-        assert self.chunks is not None
         ends = zip(index, self.chunks, self.shape, strict=True)
         return tuple(slice(i * size, min((i + 1) * size, n)) for i, size, n in ends)
-
-    def resized(self, lengths: Mapping[str, int]) -> Field:
-        """Return the field with other lengths of some dimensions."""
-        shape = tuple(lengths.get(dim, n) for dim, n in zip(self.dims, self.shape, strict=True))
-        return replace(self, shape=shape)
 
     def metadata(self) -> dict[str, Any]:
         """Return the array as zarr describes it."""
@@ -122,10 +112,6 @@ class Field:
             raise ValueError("an array is laid out otherwise than here")
         return known
 
-    def is_like(self, other: Field) -> bool:
-        """Return True if another field has the same dimensions, shape, dtype and chunks."""
-        return (self.dims, self.shape, self.dtype, self.chunks) == (other.dims, other.shape, other.dtype, other.chunks)
-
     @property
     def filled(self) -> float:
         """The number where nothing has been written."""
@@ -146,10 +132,7 @@ class Store:
         attributes: Mapping[str, Any],
         values: Mapping[str, np.ndarray] | None = None,
     ) -> Store:
-        """Make a store, with the values of some arrays of one chunk; the others have none.
-
-        It is made beside its place, and moved there: it is whole, or it is not there.
-        """
+        """Make a store beside its place, and move it there, with the values of some arrays of one chunk."""
         place = Path(path)
         for name in fields:
             if not is_name(name):
@@ -229,8 +212,9 @@ class Store:
 
     def check_made_of(self, fields: Mapping[str, Field]) -> None:
         """Check that the arrays are those of the call that opens the store."""
+        alike = attrgetter("dims", "shape", "dtype", "chunks")
         for name in {**fields, **self.fields}:
-            if name in self.fields and not (name in fields and fields[name].is_like(self.fields[name])):
+            if name in self.fields and not (name in fields and alike(fields[name]) == alike(self.fields[name])):
                 raise self.damaged(f"its array {name!r} is not one that the call makes")
             if name not in self.fields or not (self.path / name).is_dir():
                 raise self.damaged(f"its array {name!r} is missing")
@@ -249,17 +233,8 @@ class Store:
         return self._file(name, index).exists()
 
     def write(self, name: str, index: tuple[int, ...], values: np.ndarray) -> None:
-        """Write one chunk; at the edge of the array, or of one that is to grow, `values` may be smaller than a chunk.
-
-        Raises
-        ------
-        ValueError
-            If the values do not fit into the chunk.
-        StoreError
-            If they cannot be written, as on a full disk.
-        """
+        """Write one chunk, into which `values` must fit; at the edge of the array they may be smaller."""
         known = self.fields[name]
-        assert known.chunks is not None
         values = np.asarray(values)
         if values.ndim != len(known.chunks) or (np.array(values.shape) > known.chunks).any():
             raise ValueError(f"`values` of shape {values.shape} are not a chunk of {name!r}, of shape {known.chunks}.")
@@ -284,7 +259,6 @@ class Store:
             for i in product(*map(range, known.grid)):
                 whole[known.region(i)] = self.read(name, i)
             return whole
-        assert known.chunks is not None
         shape = tuple(part.stop - part.start for part in known.region(index))
         size = prod(known.chunks) * known.dtype.itemsize
         try:
@@ -313,7 +287,10 @@ class Store:
         state: Mapping[str, np.ndarray] | None = None,
     ) -> None:
         """Set the lengths of dimensions, attributes, and the state to go on from, all at once or not at all."""
-        fields = {name: known.resized(lengths or {}) for name, known in self.fields.items()}
+        fields, lengths = dict(self.fields), lengths or {}
+        for name, known in fields.items():
+            shape = tuple(lengths.get(dim, n) for dim, n in zip(known.dims, known.shape, strict=True))
+            fields[name] = replace(known, shape=shape)
         changed = self.attributes | dict(attributes or {})
         before = self.attributes.get(KEPT)
         with _told(self.path):
@@ -387,7 +364,6 @@ class Appender:
         self.axes = {name: known.dims.index(dim) for name, known in store.fields.items() if dim in known.dims}
         name, axis = next(iter(self.axes.items()))
         known = store.fields[name]
-        assert known.chunks is not None
         self.size, self.length = known.chunks[axis], known.shape[axis]
         self.tails: dict[str, list[np.ndarray]] = {name: [] for name in self.axes}
         self.held = self.length % self.size
@@ -415,14 +391,11 @@ class Appender:
         """Write full chunks, and keep what is left."""
         first = (self.length - self.held) // self.size
         for name, axis in self.axes.items():
-            tail = np.concatenate(self.tails[name], axis=axis)
-            for k in range(n_chunks):
-                part = [slice(None)] * tail.ndim
-                part[axis] = slice(k * self.size, (k + 1) * self.size)
-                self.store.write(name, self._index(name, first + k), tail[tuple(part)])
-            part = [slice(None)] * tail.ndim
-            part[axis] = slice(n_chunks * self.size, None)
-            self.tails[name] = [tail[tuple(part)].copy()]
+            ends = range(self.size, n_chunks * self.size + 1, self.size)
+            *full, rest = np.split(np.concatenate(self.tails[name], axis=axis), ends, axis=axis)
+            for k, part in enumerate(full):
+                self.store.write(name, self._index(name, first + k), part)
+            self.tails[name] = [rest.copy()]
         self.held -= n_chunks * self.size
 
     def commit(
@@ -455,18 +428,14 @@ def read_arrays(file: Path, most: int) -> dict[str, np.ndarray]:
             if member.compress_type != zipfile.ZIP_STORED:
                 raise ValueError(f"{member.filename} is packed")
             content = io.BytesIO(archive.read(member))
-            shape, _, dtype = _npy_header(content)
+            if np.lib.format.read_magic(content) != (1, 0):
+                raise ValueError("an array of another format")
+            shape, _, dtype = np.lib.format.read_array_header_1_0(content)
             if prod(shape) * dtype.itemsize != member.file_size - content.tell():
                 raise ValueError(f"{member.filename} has another length")
             content.seek(0)
             arrays[member.filename.removesuffix(".npy")] = np.load(content, allow_pickle=False)
     return arrays
-
-
-def _npy_header(content: Any) -> tuple[tuple[int, ...], bool, np.dtype]:
-    if np.lib.format.read_magic(content) != (1, 0):
-        raise ValueError("an array of another format")
-    return np.lib.format.read_array_header_1_0(content)
 
 
 def difference(theirs: Mapping[str, str], mine: Mapping[str, str]) -> str:

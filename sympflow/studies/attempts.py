@@ -272,7 +272,7 @@ def columns(
 def any_step() -> Iterator[None]:
     """Run without warnings of steps that are too long: studies sweep these, and a row has its energy error."""
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "`dt` .* is too long")
+        warnings.filterwarnings("ignore", "`(dt|rtol)` .* is too (long|large)")
         yield
 
 
@@ -281,18 +281,7 @@ def any_step() -> Iterator[None]:
 
 @dataclass
 class Attempt:
-    """A candidate on its way to a row: its solutions, and the figures over time that are drawn.
-
-    Attributes
-    ----------
-    candidate : Candidate
-    row : Row
-    sols : tuple of Solution
-        The runs, of one method under one set of conditions; empty if it does not apply or broke.
-    energy, volume : ndarray or None
-        |energy error| (..., n), of a driven system that of the balance, and volume error (..., n) at the times of the
-        solution, where these were measured.
-    """
+    """A candidate on its way to a row: its solutions, and energy and volume errors (..., n) over time, if measured."""
 
     candidate: Candidate
     row: Row

@@ -291,22 +291,18 @@ def _match(
     for one in runs:
         if anchor is None or one is anchor or one.row.status == "not applicable":
             continue
-        if not tunable(one.candidate.integrator):
+        integrator = one.candidate.integrator
+        if integrator.trained or not (isinstance(integrator, FixedStep) or tolerance_of(integrator) is not None):
             one.note(f"Not matched: {one.candidate.label} has no step to tune.")
             continue
         say(f"{system.name}: matching {one.candidate.label}")
-        integrator, reached = matched(one.candidate.integrator, system, figure, target, what == "energy_error")
+        integrator, reached = matched(integrator, system, figure, target, what == "energy_error")
         one.candidate = replace(one.candidate, integrator=integrator)
         row = Row(_identify(system), one.candidate.method, one.candidate.label)
         one.row = replace(row, compile_time=one.row.compile_time)
         one.run(run)
         if not abs(math.log(reached / target)) < 0.1:
             one.note(f"Matched only to {reached:.2g} where {anchor.candidate.label} has {target:.2g}.")
-
-
-def tunable(integrator: Integrator) -> bool:
-    """Tell whether the method has a step or a tolerance that may be changed; a trained flow has none."""
-    return not integrator.trained and (isinstance(integrator, FixedStep) or tolerance_of(integrator) is not None)
 
 
 def tuned(integrator: Integrator, system: HamiltonianSystem, factor: float) -> Integrator:
@@ -382,17 +378,16 @@ class Comparison(Report):
 
     columns: ClassVar[tuple[str, ...]] = (
         *("system", "method", "label", "status", "reason", "dt", "tolerance", "backend", "run_time", "run_time_spread"),
+        *("compile_time", "force_evaluations", "hessian_evaluations", "error", "energy_error", "balance_error"),
         *(
-            "compile_time",
-            "force_evaluations",
-            "hessian_evaluations",
-            "error",
-            "energy_error",
-            "balance_error",
             "energy_drift",
             "energy_drift_error",
+            "volume_error",
+            "symplecticity_defect",
+            "conformal_defect",
+            "time_reversal_error",
         ),
-        *("volume_error", "symplecticity_defect", "conformal_defect", "time_reversal_error", "training_time"),
+        "training_time",
     )
 
     system: HamiltonianSystem

@@ -212,22 +212,12 @@ def _checked_period(system: HamiltonianSystem, period: float | None, plane: list
 
 def _section(orbits: Orbits, seen: Crossings, where: Plane | float) -> PoincareSection:
     """The result, by the plane or by the period."""
-    plane = where if isinstance(where, Plane) else None
-    return PoincareSection(
-        orbits.system,
-        orbits.integrator,
-        orbits.t_span,
-        orbits.rows,
-        None if plane is None else plane.coordinate,
-        None if plane is None else plane.level,
-        None if plane is None else plane.direction,
-        seen.trajectory,
-        seen.t,
-        seen.states,
-        seen.status if orbits.batch else int(seen.status[0]),
-        seen.message,
-        where if isinstance(where, float) else None,
-    )
+    plane: Any = (None, None, None)
+    if isinstance(where, Plane):
+        plane = (where.coordinate, where.level, where.direction)
+    status, period = seen.status if orbits.batch else int(seen.status[0]), where if isinstance(where, float) else None
+    found: Any = (seen.trajectory, seen.t, seen.states, status, seen.message, period)
+    return PoincareSection(orbits.system, orbits.integrator, orbits.t_span, orbits.rows, *plane, *found)
 
 
 @dataclass(frozen=True, repr=False)
@@ -286,9 +276,7 @@ class PoincareSection(Report):
     @cached_property
     def rows(self) -> tuple[Any, ...]:
         """One for each crossing: trajectory, t, and the coordinates q1 … pd."""
-        d = self.system.ndof
-        columns = [("trajectory", int), ("t", float), *((name, float) for name in names(d))]
-        Crossing = make_dataclass("Crossing", columns, frozen=True)
+        Crossing = make_dataclass("Crossing", self.columns, frozen=True)
         return tuple(
             Crossing(int(k), float(t), *map(float, y))
             for k, t, y in zip(self.trajectory, self.t, self.states, strict=True)

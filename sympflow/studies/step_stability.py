@@ -170,7 +170,11 @@ def stability(
                 with attempts.any_step():
                     own = [study.row(h) for h in study.lengths(lengths)]
                     rows += own
-                    if limits and study.has_steps and any(_ran(row) for row in own):
+                    if (
+                        limits
+                        and study.has_steps
+                        and any(row.status not in ("not applicable", "failed") for row in own)
+                    ):
                         found.append(step_limit(study, own))
     return StabilityReport(family, tuple(metrics), float(bound), tuple(rows), tuple(found))
 
@@ -189,16 +193,8 @@ def initial_states(system: HamiltonianSystem, y0: ArrayLike | None) -> np.ndarra
     if given.ndim == 2:
         return given
     system = started(system, given)
-    times = system.dt * np.array(PHASES)
-    sol = solve(
-        system,
-        "dop853",
-        (0.0, float(times[-1])),
-        given,
-        t_eval=times,
-        rtol=1e-11,
-        atol=1e-13 * smallest_size(system, given),
-    )
+    times, atol = system.dt * np.array(PHASES), 1e-13 * smallest_size(system, given)
+    sol = solve(system, "dop853", (0.0, float(times[-1])), given, t_eval=times, rtol=1e-11, atol=atol)
     return sol.states if sol.success and np.isfinite(sol.y).all() else given[None]
 
 
@@ -316,19 +312,16 @@ class Study:
                 for y in ([y0] if together else list(y0))
             ]
 
+    @property
+    def named(self) -> dict[str, Any]:
+        """The system, its first parameter, the method and the precision, as fields of rows and limits."""
+        parameter, value = next(iter(self.system.params.items()), (None, None))
+        own = {"method": self.candidate.method, "label": self.candidate.label, "dtype": self.dtype}
+        return {"system": self.system.title, "parameter": parameter, "value": value, **own}
+
     def attempt(self, h: float | None, span: tuple[float, float]) -> Attempt:
         """Run all initial states with one step; the row has the largest energy error, and the status."""
-        params = self.system.params
-        row = Row(
-            self.system.title,
-            self.candidate.method,
-            self.candidate.label,
-            parameter=next(iter(params), None),
-            value=next(iter(params.values()), None),
-            dtype=self.dtype,
-            t_end=self.span(h)[1],
-        )
-        one = Attempt(self.candidate, row)
+        one = Attempt(self.candidate, Row(**self.named, t_end=self.span(h)[1]))
         one.run(lambda _: self.runs(self.with_step(h), h, span))
         one.fill(dt=h)
         if one.sol is not None:
@@ -371,7 +364,8 @@ class Study:
             one.measure(MEASURES, self.metrics)
             window = None if h is None or self.linear is None else self.linear.window_of(h)
             if window is not None and one.row.status in STABLE and self.small and self.small.equilibrium is not None:
-                one.note(f"Small oscillations are unstable here: they grow {_by(window.growth)} a step.")
+                by = "without bound" if window.growth == math.inf else f"by up to a factor {window.growth:.5g}"
+                one.note(f"Small oscillations are unstable here: they grow {by} a step.")
         return one.row
 
 
@@ -503,10 +497,6 @@ def _note_blow_up(one: Attempt) -> None:
 # the longest stable step ----------------------------------------------------------------------------------------------
 
 
-def _ran(row: Row) -> bool:
-    return row.status not in ("not applicable", "failed")
-
-
 def step_limit(study: Study, rows: Sequence[Row]) -> StepLimit:
     """Find the longest stable step: the first loss of stability."""
     tried = [row for row in rows if row.dt is not None and row.status != "not applicable"]
@@ -524,22 +514,13 @@ def step_limit(study: Study, rows: Sequence[Row]) -> StepLimit:
     error = None
     if low is not None:
         error = study.stable(low / PRECISION if study.known else low)[1]
-    c, params, linear = study.candidate, study.system.params, study.linear
-    return StepLimit(
-        study.system.title,
-        next(iter(params), None),
-        next(iter(params.values()), None),
-        c.method,
-        c.label,
-        study.dtype,
-        low,
-        high,
-        error,
-        reached,
-        None if study.small is None else study.small.fastest,
-        None if linear is None or not linear.windows else linear.limit,
-        () if linear is None or study.small is None or study.small.equilibrium is None else linear.intervals,
-    )
+    linear, small = study.linear, study.small
+    found: dict[str, Any] = {"stable": low, "unstable": high, "energy_error": error, "reached": reached}
+    found["frequency"] = None if small is None else small.fastest
+    found["linear"] = None if linear is None or not linear.windows else linear.limit
+    if linear is not None and small is not None and small.equilibrium is not None:
+        found["intervals"] = linear.intervals
+    return StepLimit(**study.named, **found)
 
 
 @dataclass
@@ -573,7 +554,9 @@ class Search:
             start = self._start()
             if start is None:
                 return None, min(self.found), ""
-            top = self._first_unstable_double(start, longest)
+            top = start
+            while top < longest and self.stable(top):
+                top *= 2
             ratio = FINE if study.compiled else COARSE
             below = math.floor(math.log(2**OCTAVES) / math.log(ratio))
             steps = [top / ratio**k for k in range(below, -1, -1)] if not self.stable(top) else [top]
@@ -595,11 +578,6 @@ class Search:
                 return h
             h /= 2
         return None
-
-    def _first_unstable_double(self, h: float, longest: float) -> float:
-        while h < longest and self.stable(h):
-            h *= 2
-        return h
 
     def _in_windows(self) -> list[float]:
         """Steps where small oscillations are unstable, a few in each window."""
@@ -631,10 +609,6 @@ class Search:
             middle = math.sqrt(low * high)
             low, high = (middle, high) if self.stable(middle) else (low, middle)
         return low, high
-
-
-def _by(growth: float) -> str:
-    return "without bound" if growth == math.inf else f"by up to a factor {growth:.5g}"
 
 
 # the report -----------------------------------------------------------------------------------------------------------
@@ -719,7 +693,10 @@ class StabilityReport(Report):
         ]
         parts = [text_table(self._limit_columns()), *self.without_limit(), ""] if self.limits else []
         below = ["", "Notes", *dict.fromkeys(notes)] if notes else []
-        return "\n".join([*parts, text_table(self._columns()), *below])
+        titles = ("step", "steps", "energy error", "drift per unit t", "blow-up at t", "leaves domain at t")
+        more = ("volume error", "sympl. defect", "status")
+        columns = [*self._names(self.rows), *attempts.columns(self.rows, titles + more, {"blow-up at t": _end})]
+        return "\n".join([*parts, text_table(columns), *below])
 
     def without_limit(self) -> list[str]:
         """For each method whose longest stable step is not found on some systems, where that is and why: sentences."""
@@ -790,11 +767,6 @@ class StabilityReport(Report):
             Column("small oscillations are stable in", [_intervals(x.intervals) for x in self.limits], left=True),
             Column("stable", [x.reached for x in self.limits], left=True),
         ]
-
-    def _columns(self) -> list[Column]:
-        titles = ("step", "steps", "energy error", "drift per unit t", "blow-up at t", "leaves domain at t")
-        more = ("volume error", "sympl. defect", "status")
-        return [*self._names(self.rows), *attempts.columns(self.rows, titles + more, {"blow-up at t": _end})]
 
     def _names(self, rows: Sequence[Row | StepLimit]) -> list[Column]:
         several = len(self.systems) > 1

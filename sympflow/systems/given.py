@@ -21,10 +21,7 @@ NAME = re.compile(r"[A-Za-z][A-Za-z0-9]*([-_][A-Za-z0-9]+)*")
 
 
 def given_system(system: Any, params: Mapping[str, Any] | None = None) -> HamiltonianSystem:
-    """Return the system that an argument means: one, the name of a scene, or H as `from_sympy` takes it.
-
-    The first values of `params` are those of the symbols of H.
-    """
+    """The system that an argument means: one, the name of a scene, or H, the first values of `params` its symbols'."""
     if isinstance(system, HamiltonianSystem):
         return system
     if isinstance(system, str):

@@ -16,8 +16,7 @@ from typing import Any
 from sympflow.arguments import did_you_mean
 from sympflow.hamiltonian.domain import Ball, Box, EnergySublevel, Tube, domain_from_dict
 from sympflow.hamiltonian.lattice_states import LatticeStates
-from sympflow.hamiltonian.scene import UNNAMED
-from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.hamiltonian.system import UNNAMED, HamiltonianSystem
 
 DOMAINS: dict[str, tuple[str, ...]] = {  # the kinds of domains in a TOML file, and the keys of each
     "Ball": ("center", "radius"),
@@ -80,11 +79,7 @@ def from_toml(path: str | os.PathLike[str], **params: float) -> HamiltonianSyste
 
 
 def factory(path: str | os.PathLike[str], name: str | None = None) -> Callable[..., HamiltonianSystem]:
-    """The function that makes the system of a file; its parameters are those of the system, with their defaults.
-
-    A .py file is run, as `python file.py` would, but for its ``__main__`` part; the name is that of a HamiltonianSystem
-    in it, or of a function that returns one, and may be left out where there is one only.
-    """
+    """The function that makes the system of a file, of a name in it if it is one of Python, which is run for it."""
     file = Path(path)
     if file.suffix == ".toml":
         return _of_toml(file, name)

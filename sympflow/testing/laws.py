@@ -51,7 +51,7 @@ def run(
     """A solution of the integrator's, from the system's y0 unless another is given."""
     y0 = start(system) if y0 is None else y0
     with warnings.catch_warnings():  # the methods of low order are judged by their laws, at any step
-        warnings.filterwarnings("ignore", "`dt` .* is too long", RuntimeWarning)
+        warnings.filterwarnings("ignore", "`(dt|rtol)` .* is too (long|large)", RuntimeWarning)
         return solve(system, integrator, t_span, y0=y0, on_domain_exit="ignore", **arguments)
 
 
@@ -395,10 +395,7 @@ def events_are_zeros_of_the_dense_output(integrator: Integrator, system: Hamilto
 
 
 def statistics(integrator: Integrator, system: HamiltonianSystem) -> None:
-    """n_steps, force_evaluations, hessian_evaluations and backend are reported, as counts and a word.
-
-    Only a trained flow evaluates no forces. The count for one step is that of the step on the system's own functions.
-    """
+    """The numbers of steps, forces and Hessians, and the backend are reported; a step's are those of the system."""
     stats = run(integrator, system, (0.0, T_END)).stats
     for key in ("n_steps", "force_evaluations", "hessian_evaluations", "backend"):
         assert key in stats, f"stats lack {key!r}"

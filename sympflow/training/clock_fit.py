@@ -31,7 +31,7 @@ def train_clock(system: HamiltonianSystem, fit: ClockedFit, domain: Domain) -> C
     flow = ClockedFlow(transformed.ndof, scheme, terms, dt * time_scale(system, shift), transformed)
     x = lifted(system, states(domain, points, seed, Stream.RESIDUAL), shift)
     s = np.repeat(flow.dt * np.arange(1, label_times + 1) / label_times, len(x))
-    late = _lateness(flow, system, np.tile(x, (label_times, 1)), s)[1]
+    late = _lateness(flow, system, np.tile(x, (label_times, 1)), s)
     B = np.tile(x[:, -1], label_times)
     columns = np.stack([s ** (3 + 2 * k) * B**k for k in range(terms)], axis=-1)
     unit = np.abs(columns).max(0)
@@ -56,10 +56,8 @@ def train_clock(system: HamiltonianSystem, fit: ClockedFit, domain: Domain) -> C
     return flow
 
 
-def _lateness(
-    flow: ClockedFlow, system: HamiltonianSystem, x: np.ndarray, s: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """ψ̄_s(x) of rows, and how much later than it holds the exact solution is where it comes: (N, 2d + 2), (N,)."""
+def _lateness(flow: ClockedFlow, system: HamiltonianSystem, x: np.ndarray, s: np.ndarray) -> np.ndarray:
+    """How much later than ψ̄_s(x) of rows holds the exact solution is where it comes: (N,)."""
     transformed = flow.system
     assert transformed is not None
     end = flow.kernel_for(transformed).step(s, x).states
@@ -69,7 +67,7 @@ def _lateness(
         exact = _at(system, start, t)
         v = system.vector_field(exact)
         t = t + ((y - exact) * v).sum(-1) / (v * v).sum(-1)
-    return end, t - held
+    return t - held
 
 
 def clock_errors(

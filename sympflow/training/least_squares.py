@@ -1,9 +1,8 @@
 """Levenberg–Marquardt: least squares by Gauss–Newton steps, damped where the linear model fails.
 
 There is one method, `descend`, of the steps of `damped_step`, and a `LinearModel` for each way to solve the linear
-problem of a step: `levenberg_marquardt` minimizes a function of a few numbers by compiled QR factorizations,
-`GaussNewtonSteps` trains the weights of a flow by Cholesky's factors, one step at a time, and
-`sympflow.learning.shooting` eliminates the initial states of orbits.
+problem of a step: QR factorizations of a few numbers, Cholesky's factors of the weights of a flow, and in
+`sympflow.learning.shooting` elimination of the initial states of orbits.
 
 References
 ----------
@@ -167,10 +166,7 @@ def levenberg_marquardt(
         return model
 
     level = Damping(damping, LEAST_DAMPING)
-    try:
-        costs = [cost_at(x)]
-    except OutOfTime:
-        return Minimum(x, math.inf, 0, STOPPED)
+    costs = [cost_at(x)]
     if not math.isfinite(costs[0]):
         return Minimum(x, math.inf, 0, "the residuals are not finite at the start")
     options: Any = {"damping": level, "tries": MAX_REJECTED, "iterations": iterations, "patience": patience}
@@ -275,21 +271,25 @@ def put_weights(parameters: Sequence[Tensor], x: Tensor) -> None:
         w.copy_(part.view_as(w))
 
 
+def check_parameters(flow: FlowMap, keeps: str) -> None:
+    """Raise ValueError where a flow has too many parameters for a dense matrix."""
+    if flow.n_parameters > MAX_PARAMETERS:
+        raise ValueError(
+            f"`optimizer` {keeps} and takes at most {MAX_PARAMETERS} parameters; the flow has {flow.n_parameters}: use "
+            "'lbfgs' or 'adam'."
+        )
+
+
 class GaussNewtonSteps:
     """Levenberg–Marquardt on the residuals of a flow, one accepted step at a time; it trains networks best.
 
-    To r belongs a tiny multiple of the weights: a neuron that is saturated at all points may else run off to a step of
-    any slope. The steps end where `PATIENCE` of them on the same points lower the loss by less than 1 %, or none does.
+    To r belongs a tiny multiple of the weights: a neuron that is saturated at all points may else run off.
     """
 
     needs_residuals: ClassVar[bool] = True
 
     def __init__(self, flow: FlowMap) -> None:
-        if flow.n_parameters > MAX_PARAMETERS:
-            raise ValueError(
-                f"`optimizer` 'gauss-newton' keeps a dense Jacobian and takes at most {MAX_PARAMETERS} parameters; the "
-                f"flow has {flow.n_parameters}: use 'lbfgs' or 'adam'."
-            )
+        check_parameters(flow, "'gauss-newton' keeps a dense Jacobian")
         self.parameters = list(flow.parameters())
         self.damping = Damping(FIRST_DAMPING, LEAST_DAMPING_OF_WEIGHTS)
         self.scale: Tensor | None = None  # D²
@@ -298,14 +298,8 @@ class GaussNewtonSteps:
         self.finished: str | None = None
 
     def state_dict(self) -> dict[str, Any]:
-        return {
-            "damping": self.damping.value,
-            "growth": self.damping.growth,
-            "scale": self.scale,
-            "costs": self.costs,
-            "draw": self.draw,
-            "finished": self.finished,
-        }
+        told = {name: getattr(self, name) for name in ("scale", "costs", "draw", "finished")}
+        return {"damping": self.damping.value, "growth": self.damping.growth, **told}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         n, scale = sum(w.numel() for w in self.parameters), state["scale"]

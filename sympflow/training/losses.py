@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -129,7 +128,7 @@ class Objective:
         loss, points, flow, tangents = self.loss, self.points, self.flow, self.tangents
         blocks: list[_Block | _Compiled] = []
         if loss.residual_weight and tangents is not None:
-            blocks.append(_CompiledResidual(loss.residual_weight, loss, flow, tangents, *points.residual))
+            blocks.append(_Compiled(loss.residual_weight, loss, flow, tangents, *points.residual))
         elif loss.residual_weight:
             blocks.append(_Block(loss.residual_weight, flow, loss.residual, points.residual))
         if loss.matching_weight:
@@ -139,11 +138,11 @@ class Objective:
             blocks.append(_Block(loss.matching_weight, flow, loss.mismatch, matched, x.shape[:2]))
         if loss.label_weight:
             assert points.labels is not None
-            if tangents is None:
-                blocks.append(_Block(loss.label_weight, flow, loss.label_error, points.labels))
+            t, x, y, *t0 = points.labels
+            if tangents is not None:
+                blocks.append(_Compiled(loss.label_weight, loss, flow, tangents, t, x, *t0, ends=y))
             else:
-                t, x, y, *t0 = points.labels
-                blocks.append(_CompiledLabels(loss.label_weight, loss, flow, tangents, t, x, *t0, y=y))
+                blocks.append(_Block(loss.label_weight, flow, loss.label_error, points.labels))
         return blocks
 
 
@@ -174,16 +173,24 @@ class _Block:
         return weight * values.flatten(leading)
 
 
-class _Compiled(ABC):
-    """A loss of a flow of networks that counts, by compiled loops: its weight, its points, one a row."""
+class _Compiled:
+    """The residual of a flow of networks, or its errors at labels with these `ends`, by compiled loops."""
 
     def __init__(
-        self, weight: float, loss: Loss, flow: FlowMap, tangents: NetworkTangents, t: Tensor, x: Tensor, *t0: Tensor
+        self,
+        weight: float,
+        loss: Loss,
+        flow: Any,
+        tangents: NetworkTangents,
+        t: Tensor,
+        x: Tensor,
+        *t0: Tensor,
+        ends: Tensor | None = None,
     ) -> None:
-        self.loss, self.tangents = loss, tangents
-        self.share = (weight / len(t)) ** 0.5
-        self.unit = np.array(loss.scaling.x)
-        self.t, self.x, self.t0 = t, x, t0
+        self.system, self.tangents, self.t, self.t0 = loss.system, tangents, t, t0
+        self.ends = None if ends is None else ends.detach().numpy()
+        unit = loss.scaling.t if ends is None else 1.0
+        self.weights = (weight / len(t)) ** 0.5 * unit / np.array(loss.scaling.x)
         self._parameters = torch.cat([w.detach().reshape(-1) for w in flow.parameters()]).numpy()
         arrays = t, x, flow.step_constants(x, *t0)
         self._points = tuple(np.ascontiguousarray(a.detach().numpy()) for a in arrays)
@@ -195,57 +202,29 @@ class _Compiled(ABC):
     def linearized(self, check: Callable[[], None]) -> tuple[Tensor, Tensor]:
         """The residuals (m,) and their Jacobian (m, n), which the next call for as many points overwrites."""
         check()
-        ends = self._values()
-        J = self.tangents.jacobian(self._parameters, *self._points, *self._factors(ends[0]))
-        return self._at(*ends), torch.from_numpy(J.reshape(len(J), -1)).T
+        y, velocity = self._values()
+        factors: tuple[np.ndarray, ...]  # the derivatives of the residuals by ψ̄_t(x), and by d/dt ψ̄_t(x)
+        if self.ends is None:
+            of_field = -self._field("field_jacobian", y) * self.weights[:, None]
+            factors = np.ascontiguousarray(of_field), self.weights
+        else:
+            factors = (np.repeat(np.diag(self.weights)[None], len(y), 0),)
+        J = self.tangents.jacobian(self._parameters, *self._points, *factors)
+        return self._at(y, velocity), torch.from_numpy(J.reshape(len(J), -1)).T
 
     def _values(self) -> tuple[np.ndarray, np.ndarray]:
+        """ψ̄_t(x), and d/dt ψ̄_t(x) where it counts."""
         t, x, constants = self._points
-        return self.tangents.values(self._parameters, t, x, constants, self.by_velocity)
-
-    by_velocity: ClassVar[bool]
-
-    @abstractmethod
-    def _at(self, y: np.ndarray, velocity: np.ndarray) -> Tensor:
-        """The residuals of ψ̄_t(x) and d/dt ψ̄_t(x)."""
-
-    @abstractmethod
-    def _factors(self, y: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Their derivatives by ψ̄_t(x), and by d/dt ψ̄_t(x) if they depend on that."""
-
-
-class _CompiledLabels(_Compiled):
-    by_velocity = False
-
-    def __init__(self, *given: Any, y: Tensor) -> None:
-        super().__init__(*given)
-        self.y = y.detach().numpy()
+        return self.tangents.values(self._parameters, t, x, constants, self.ends is None)
 
     def _at(self, y: np.ndarray, velocity: np.ndarray) -> Tensor:
-        return torch.from_numpy(((y - self.y) * (self.share / self.unit)).T.reshape(-1))
-
-    def _factors(self, y: np.ndarray) -> tuple[np.ndarray, ...]:
-        return (np.repeat(np.diag(self.share / self.unit)[None], len(y), 0),)
-
-
-class _CompiledResidual(_Compiled):
-    by_velocity = True
-
-    def _at(self, y: np.ndarray, velocity: np.ndarray) -> Tensor:
-        r = velocity - self._field("vector_field", y)
-        return torch.from_numpy((r * self._weights()).T.reshape(-1))
-
-    def _factors(self, y: np.ndarray) -> tuple[np.ndarray, ...]:
-        weights = self._weights()
-        return np.ascontiguousarray(-self._field("field_jacobian", y) * weights[:, None]), weights
-
-    def _weights(self) -> np.ndarray:
-        return self.share * self.loss.scaling.t / self.unit
+        r = velocity - self._field("vector_field", y) if self.ends is None else y - self.ends
+        return torch.from_numpy((r * self.weights).T.reshape(-1))
 
     def _field(self, name: str, y: np.ndarray) -> np.ndarray:
         """The vector field or its Jacobian at the ends, as torch has it, which any H can do."""
         states = torch.from_numpy(y)
-        return getattr(self.loss.system, name)(states, *_later(self.t, states, *self.t0)).detach().numpy()
+        return getattr(self.system, name)(states, *_later(self.t, states, *self.t0)).detach().numpy()
 
 
 class _Evaluation(nn.Module):

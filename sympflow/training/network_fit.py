@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-import warnings
 from typing import Any, ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from sympflow.arguments import warn
 from sympflow.flow.flow_map import FlowMap
 from sympflow.flow.scaling import Scaling
 from sympflow.flow.weights import check_memory
@@ -245,12 +245,7 @@ def _check_memory(flow: FlowMap, fit: Resolved, solver: Solver) -> None:
     if fit.label_weight and fit.data is None:
         of_points += (fit.points + fit.validation_points) * fit.label_times * width
     check_memory(f"`points` {fit.points} and `validation_points`", of_points, "take fewer")
-    kept = {
-        "adam": 4 * n,
-        "lbfgs": 2 * MEMORY * n,
-        "bfgs": 3 * n**2,
-        "gauss-newton": 3 * n * (fit.points * width + n),
-    }
+    kept = {"adam": 4 * n, "lbfgs": 2 * MEMORY * n, "bfgs": 3 * n**2, "gauss-newton": 3 * n * (fit.points * width + n)}
     smaller = "take fewer `points`, a smaller network, or optimizer='adam'"
     check_memory(f"`optimizer` {solver.name!r} of {n} parameters", kept[solver.name], smaller)
 
@@ -270,11 +265,10 @@ def _end_of_step(
     try:
         return reference_step(system, x, dt, check=deadline.check, t0=t0)
     except OutOfTime:
-        warnings.warn(
+        warn(
             f"There was no time to follow {len(x)} held-out states to dt = {dt:g}: the one-step error of the flow is "
             "not known. Give a longer `time_budget`, a shorter `dt`, or fewer `reference_states`.",
             RuntimeWarning,
-            stacklevel=6,
         )
         return np.full_like(x, np.nan)
 

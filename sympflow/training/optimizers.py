@@ -1,14 +1,11 @@
-"""The optimizers of losses: one small class each, chosen by `optimizer`.
-
-Gauss–Newton, which needs residuals, is in `least_squares`.
-"""
+"""The optimizers of losses: one small class each; Gauss–Newton, which needs residuals, is in `least_squares`."""
 
 from __future__ import annotations
 
 import math
 import warnings
 from collections.abc import Callable, Iterator
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -18,26 +15,11 @@ from torch import Tensor
 from sympflow.flow.flow_map import FlowMap
 from sympflow.training import fits
 from sympflow.training.fits import Solver
-from sympflow.training.least_squares import MAX_PARAMETERS, GaussNewtonSteps, put_weights, weight_vector
-from sympflow.training.losses import Objective
+from sympflow.training.least_squares import GaussNewtonSteps, check_parameters, put_weights, weight_vector
 from sympflow.training.session import OutOfTime
 
 ITERATIONS = 20  # of quasi-Newton methods, in a step
 MEMORY = 30
-
-
-class Optimizer(Protocol):
-    """A method that lowers an objective of the flow that it was made for."""
-
-    finished: str | None
-    needs_residuals: ClassVar[bool]
-
-    def step(self, index: int, objective: Objective) -> float:
-        """Take a step; the loss before it."""
-
-    def state_dict(self) -> dict[str, Any]: ...
-
-    def load_state_dict(self, state: dict[str, Any]) -> None: ...
 
 
 class _TorchSteps:
@@ -111,21 +93,14 @@ class LBFGSSteps(_TorchSteps):
 class BFGSSteps:
     """BFGS with Oren and Luenberger's self-scaling, limited to growth of the inverse Hessian B: 20 iterations a step.
 
-    A B that has learnt the curvature far from the minimum is soon forgotten, so that on small networks it gets orders
-    of magnitude further than limited-memory BFGS [1]_. The line search is SciPy's, for the strong Wolfe conditions.
-
-    .. [1] J. F. Urbán, P. Stefanou, J. A. Pons, J. Comput. Phys. 523 (2025) 113656.
+    On small networks far better than limited-memory BFGS: Urbán, Stefanou, Pons, J. Comput. Phys. 523 (2025) 113656.
     """
 
     finished: str | None = None
     needs_residuals: ClassVar[bool] = False
 
     def __init__(self, flow: FlowMap) -> None:
-        if flow.n_parameters > MAX_PARAMETERS:
-            raise ValueError(
-                f"`optimizer` 'bfgs' keeps a dense matrix and takes at most {MAX_PARAMETERS} parameters; the flow has "
-                f"{flow.n_parameters}: use 'lbfgs' or 'adam'."
-            )
+        check_parameters(flow, "'bfgs' keeps a dense matrix")
         self.parameters = list(flow.parameters())
         self.B: Tensor | None = None
 
@@ -216,6 +191,10 @@ class BFGSSteps:
         value.backward()
         gradients = [torch.zeros_like(w) if w.grad is None else w.grad for w in self.parameters]
         return float(value.detach()), torch.cat([g.reshape(-1) for g in gradients])
+
+
+Optimizer = AdamSteps | LBFGSSteps | BFGSSteps | GaussNewtonSteps
+"""A method whose `step` lowers an objective of the flow that it was made for, and returns the loss before it."""
 
 
 def optimizer(flow: FlowMap, solver: Solver) -> Optimizer:

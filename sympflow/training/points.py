@@ -6,7 +6,6 @@ Labels say where the exact flow takes sampled states, at several times. They are
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import IntEnum
@@ -16,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from sympflow.arguments import warn
 from sympflow.arrays import to_numpy
 from sympflow.flow.sympflow import Drive
 from sympflow.hamiltonian.domain import Domain
@@ -69,33 +69,22 @@ def states(domain: Domain, n: int, seed: int, stream: Stream, block: int = 0) ->
     return domain.sample(n, stream_seed(seed, stream, block))
 
 
-def drive_times(system: HamiltonianSystem) -> tuple[float, float] | None:
-    """The times of labels where the drive has no period, those of its `t_span`; None for another system."""
-    drive = Drive.of(system)
-    return None if drive is None else drive.times
-
-
-def times_of(system: HamiltonianSystem, dt: float) -> tuple[float, float]:
-    """The interval of the times at which steps of a driven system begin: its period, or else its `t_span` less Δt."""
-    if system.period is not None:
-        return 0.0, system.period
-    low, high = min(system.t_span), max(system.t_span)
-    system.check_times(low, high)
-    if high - low <= dt:
-        raise ValueError(
-            f"`system` {system.name!r} is driven, without a `period` and for t from {low:g} to {high:g}, in which no "
-            f"step of dt = {dt:g} begins and ends: give it the period of the drive, or a longer `t_span`."
-        )
-    return low, high - dt
-
-
 def start_times(
     system: HamiltonianSystem, dt: float, n: int, seed: int, stream: Stream, block: int = 0
 ) -> np.ndarray | None:
-    """Random times (n,) at which steps of a driven system begin; None for another."""
+    """Random times (n,) at which steps of a driven system begin, in its period or its `t_span`; None for another."""
     if Drive.of(system) is None:
         return None
-    low, high = times_of(system, dt)
+    low, high = 0.0, system.period
+    if high is None:
+        low, high = min(system.t_span), max(system.t_span)
+        system.check_times(low, high)
+        if high - low <= dt:
+            raise ValueError(
+                f"`system` {system.name!r} is driven, without a `period` and for t from {low:g} to {high:g}, in which "
+                f"no step of dt = {dt:g} begins and ends: give it the period of the drive, or a longer `t_span`."
+            )
+        high -= dt
     rng = np.random.default_rng([stream_seed(seed, stream, block), int(Stream.TIMES)])
     return low + (high - low) * rng.random(n)
 
@@ -355,12 +344,10 @@ def warn_of_another_system(data: Labelled, system: HamiltonianSystem) -> None:
         moved = np.linalg.norm((y[rows] - x[rows]) / unit, axis=-1)
     away = away[np.isfinite(away)]
     if len(away) and np.median(away) >= 0.1 * np.median(moved) and np.median(away) > COMPARED_TO:
-        warnings.warn(
+        warn(
             f"`data` are not labels of the system {system.name!r}: its exact flow takes the labelled states elsewhere, "
             f"in the median {np.median(away) / max(np.median(moved), 1e-300):.1e} times as far as they move. Figures "
-            "such as one_step_error compare with H of the system, and say nothing of your data: give its own system.",
-            UserWarning,
-            stacklevel=5,
+            "such as one_step_error compare with H of the system, and say nothing of your data: give its own system."
         )
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Generator
 from dataclasses import dataclass
@@ -11,15 +10,17 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 
+from sympflow.arguments import warn
 from sympflow.flow.flow_map import FlowMap
 from sympflow.flow.scaling import Scaling
+from sympflow.flow.sympflow import Drive
 from sympflow.hamiltonian.domain import Domain
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.training import checkpoint as checkpoints
 from sympflow.training.fits import GaussNewton, Resolved
 from sympflow.training.least_squares import STOPPED, Minimum, Problem
-from sympflow.training.points import USELESS, drive_times
-from sympflow.training.session import Deadline, Path, Session
+from sympflow.training.points import USELESS
+from sympflow.training.session import Deadline, Path, Session, shown
 
 OUT_OF_TIME = "the time budget was used up"
 NO_LABELS = "its labels were not known in their share of the time budget"
@@ -138,7 +139,7 @@ class Run(ABC):
                     self.seconds = before + session.passed
                     bar.advance(self.done, advance.loss)
                     if advance.figures is not None:
-                        bar.validated(self.done, advance.figures)
+                        bar.tries(self.done, shown(advance.figures))
                         if session.callback is not None:
                             session.callback(self.done, dict(advance.figures))
                     if session.checkpoint is not None and advance.keep:
@@ -162,13 +163,14 @@ class Run(ABC):
         An end that is expected does not warn, unless it came before the first of its steps.
         """
         if reason is not None and not (expected and self.done and reason == OUT_OF_TIME):
-            warnings.warn(self.ended_early(reason), RuntimeWarning, stacklevel=4)
+            warn(self.ended_early(reason), RuntimeWarning)
         flow, figures = self.flow, self.achieved()
         flow.requires_grad_(False)
         flow.zero_grad(set_to_none=True)
         flow.domain = self.domain
         flow.identify(self.system, self.domain)
-        flow.drive_times = drive_times(self.system)
+        drive = Drive.of(self.system)
+        flow.drive_times = None if drive is None else drive.times
         earlier = float(flow.figures.get("training_seconds", 0.0))
         stage = {**self.record, **self.remarks(reason)}
         if self.done and not stage.get("kept_start"):
@@ -193,15 +195,13 @@ class Run(ABC):
         no_better = verlet is not None and mean >= verlet[0] > 0
         if mean >= USELESS or no_better:
             beside = f", no better than one Verlet step with {verlet[0]:.1e}" if verlet and no_better else ""
-            warnings.warn(
+            warn(
                 f"The flow is far from the exact one: at held-out states its error in one step of dt = "
                 f"{self.flow.dt:g} is {mean:.1e} times what a step moves them (in the median {median:.1e} times)"
-                f"{beside}. {self.remedy}",
-                UserWarning,
-                stacklevel=5,
+                f"{beside}. {self.remedy}"
             )
         elif (words := self.left_out()) is not None:
-            warnings.warn(words, UserWarning, stacklevel=5)
+            warn(words)
         return {"missed_share": mean} | ({} if verlet is None else {"verlet_missed_share": verlet[0]})
 
     # checkpoints ------------------------------------------------------------------------------------------

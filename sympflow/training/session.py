@@ -100,10 +100,9 @@ class Session:
         deadline: Deadline,
         threads: bool = False,
     ) -> Generator[Any]:
-        """Yield `function(common, item)` of each item in order, done by the pool; the function is one of a module.
+        """Yield `function(common, item)` of each item in order, by the pool, or by `threads` where that is this one.
 
-        Where the pool is this thread alone, `threads` share the work. While others work Ctrl-C raises KeyboardInterrupt
-        here; after that, or where workers do not answer soon after the deadline, this thread does the rest.
+        While others work Ctrl-C raises here; then, or if they answer too late, this thread does the rest.
         """
         interruption = self.interruption
         ended = interruption.asked or deadline.left <= 0
@@ -210,9 +209,6 @@ class Silent:
     def advance(self, step: int, loss: float) -> None:
         pass
 
-    def validated(self, step: int, figures: dict[str, float]) -> None:
-        self.tries(step, _text(figures))
-
     def tries(self, done: int, what: str) -> None:
         pass
 
@@ -256,6 +252,7 @@ class Bar(Silent):
         self.bar.update(self.task, completed=done, figures=what)
 
 
-def _text(figures: dict[str, float]) -> str:
+def shown(figures: dict[str, float]) -> str:
+    """Figures in short."""
     names = {"loss": "held-out", "residual_loss": "L1", "matching_loss": "L2", "one_step_error": "one-step"}
     return "  ".join(f"{short} {figures[name]:.1e}" for name, short in names.items() if name in figures)

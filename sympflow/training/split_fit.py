@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,9 +16,9 @@ from scipy.linalg import block_diag
 
 from sympflow.flow.coefficients import Column
 from sympflow.flow.split import SplitFlow
-from sympflow.hamiltonian.parts import ExactParts, SubFlow
+from sympflow.hamiltonian.parts import SubFlow
 from sympflow.kernels.parts_loops import PartsLoops, parts_loops
-from sympflow.training.least_squares import Minimum, Problem, Stop, levenberg_marquardt, put_weights
+from sympflow.training.least_squares import Check, Minimum, Problem, put_weights
 from sympflow.training.points import Labels, Stream, shares_missed, step_errors, stream_seed
 from sympflow.training.runs import LABEL_SHARE, SearchRun
 from sympflow.training.session import Deadline, Session
@@ -40,8 +39,8 @@ class SplitRun(SearchRun):
     def prepare(self, deadline: Deadline) -> None:
         self.problem = SplitProblem(self, deadline)
 
-    def searched(self) -> AtEnd:
-        return AtEnd(self.problem)
+    def searched(self) -> SplitProblem:
+        return self.problem
 
     def start_of(self, restart: int) -> np.ndarray:
         """Numbers u at Δt: those of the flow as it is, then random ones."""
@@ -58,7 +57,7 @@ class SplitRun(SearchRun):
             if not math.isfinite(best.cost):
                 raise FloatingPointError("The residuals are not finite from any start: shrink `domain` or `dt`.")
             u = best.x
-        whole = self.problem.whole(u, self.whole_end.over)
+        whole = self.problem.whole(u, self.whole_end)
         last = {"step": len(self.minima), "loss": whole.cost, "iterations": whole.iterations}
         self.history.append(last | self.problem.errors())
 
@@ -66,18 +65,7 @@ class SplitRun(SearchRun):
         return self.problem.missed()
 
 
-@dataclass(frozen=True)
-class AtEnd(Problem):
-    """The fit at Δt, of the numbers u."""
-
-    problem: SplitProblem
-
-    def minimize(self, theta: np.ndarray, iterations: int, deadline: Deadline, thorough: bool = False) -> Minimum:
-        """The minimum from the numbers θ = u; none of the searches is thorough."""
-        return self.problem.minimize(theta, len(self.problem.t) - 1, iterations, deadline.over)
-
-
-class Pulled:
+class Pulled(Problem):
     """Weighted residuals at some of the times, of numbers affine in θ, and a pull of these towards equal steps."""
 
     def __init__(
@@ -94,12 +82,12 @@ class Pulled:
         self.equal = np.array([problem.equal(problem.t[j]) for j in at])
         self.pulled = (weights * pulls)[:, None] / np.array([problem.units(problem.t[j]) for j in at])
 
-    def residuals(self, theta: np.ndarray) -> np.ndarray:
+    def residuals(self, theta: np.ndarray, check: Check = lambda: None) -> np.ndarray:
         u = self.offsets + self.designs @ theta
-        data = [w * self.problem.residuals(v, j) for (w, j), v in zip(self.times, u, strict=True)]
+        data = [w * self.problem.errors_at(v, j) for (w, j), v in zip(self.times, u, strict=True)]
         return np.concatenate([*data, *(self.pulled * (u - self.equal))])
 
-    def linearized(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def linearized(self, theta: np.ndarray, check: Check = lambda: None) -> tuple[np.ndarray, np.ndarray]:
         u = self.offsets + self.designs @ theta
         each = zip(self.times, u, self.designs, strict=True)
         data = [w * self.problem.jacobian(v, j) @ design for (w, j), v, design in each]
@@ -111,12 +99,13 @@ def _phases(share: np.ndarray) -> np.ndarray:
     return np.where(share == 1, 1.0, np.sin(np.pi / 2 * share))
 
 
-class SplitProblem:
-    """Labels in modes, and the flow's coefficients as numbers: those of the first half of the palindrome."""
+class SplitProblem(Problem):
+    """Labels in modes, and the flow's coefficients as numbers u, of the first half of the palindrome: fitted at Δt."""
 
     def __init__(self, run: SplitRun, deadline: Deadline) -> None:
         flow, system, domain, fit = run.flow, run.system, run.domain, run.fit
         self.flow, self.fit, self.solver = flow, fit, run.solver
+        self.parts, self.columns = flow.parts, flow.columns()
         ends = np.cumsum([(c.n + 1) // 2 for c in self.columns])
         self.slices = [slice(int(end) - (c.n + 1) // 2, int(end)) for c, end in zip(self.columns, ends, strict=True)]
         self.n = int(ends[-1]) if len(ends) else 0
@@ -130,16 +119,8 @@ class SplitProblem:
         self.held_out = Labels.drawn(*unseen, deadline.part(LABEL_SHARE), needed=False)
 
     @property
-    def parts(self) -> ExactParts:
-        return self.flow.parts
-
-    @property
     def kernel(self) -> PartsLoops:
         return parts_loops(self.parts)
-
-    @property
-    def columns(self) -> list[Column]:
-        return self.flow.columns()
 
     def _modes(self, y: np.ndarray) -> np.ndarray:
         return np.ascontiguousarray(np.concatenate(self.parts.to_modes(y), axis=-1))
@@ -150,8 +131,8 @@ class SplitProblem:
         unit = np.where(spread > 0, spread, 1.0)
         linear, d = self.parts.linear, self.parts.ndof
         for j in range(d if linear is not None else 0):
-            if linear.kinds[j] == "oscillator" and energy > 0:  # type: ignore[union-attr]
-                unit[[j, d + j]] = math.sqrt(energy / linear.rates[j])  # type: ignore[union-attr]
+            if linear.kinds[j] == "oscillator" and energy > 0:
+                unit[[j, d + j]] = math.sqrt(energy / linear.rates[j])
         return unit
 
     def _joined(self, half: Callable[[Column, int], Any]) -> np.ndarray:
@@ -170,7 +151,8 @@ class SplitProblem:
             entries[c] = np.concatenate([half, half[: c.n // 2][::-1]])
         return self.flow._assemble(entries.__getitem__, lambda values: np.stack(values, axis=-1))
 
-    def residuals(self, u: np.ndarray, j: int) -> np.ndarray:
+    def errors_at(self, u: np.ndarray, j: int) -> np.ndarray:
+        """The residuals of the numbers u at the j-th time."""
         with np.errstate(all="ignore"):
             error = (self.kernel.step_modes(self.maps(u), self.z) - self.labels[j]) / self.unit
         return error.ravel() / math.sqrt(len(self.z))
@@ -180,7 +162,7 @@ class SplitProblem:
         for e, step in enumerate(steps):
             change = np.zeros(self.n)
             change[e] = step
-            columns.append((self.residuals(u + change, j) - self.residuals(u - change, j)) / (2 * step))
+            columns.append((self.errors_at(u + change, j) - self.errors_at(u - change, j)) / (2 * step))
         return np.stack(columns, axis=-1)
 
     # frozen at one time -------------------------------------------------------------------------------------
@@ -193,18 +175,21 @@ class SplitProblem:
         blocks = [d[0, : (c.n + 1) // 2] / t**c.power for c, (_, d) in zip(bare, affine, strict=True)]
         return offset, self.units(t)[:, None] * block_diag(*blocks)
 
-    def minimize(self, u: np.ndarray, j: int, iterations: int, stop: Stop, pull: float = 0.0) -> Minimum:
+    def minimize(self, theta: np.ndarray, iterations: int, deadline: Deadline, thorough: bool = False) -> Minimum:
+        return self.fitted(theta, len(self.t) - 1, iterations, deadline)
+
+    def fitted(self, u: np.ndarray, j: int, iterations: int, deadline: Deadline, pull: float = 0.0) -> Minimum:
         """The numbers at the j-th time that fit the labels best, pulled towards equal steps."""
         offset, design = self.frozen(self.t[j])
         unit, one = self.units(self.t[j]), np.ones(1)
         theta = np.linalg.lstsq(design / unit[:, None], (u - offset) / unit, rcond=None)[0]
         fit = Pulled(self, [j], offset[None], design[None], one, pull * one)
-        m = levenberg_marquardt(fit.residuals, fit.linearized, theta, iterations=iterations, stop=stop)
+        m = fit.minimize(theta, iterations, deadline)
         return Minimum(offset + design @ m.x, m.cost, m.iterations, m.reason)
 
     def pull(self, u: np.ndarray, j: int) -> float:
         """A pull that costs little beside the error there is."""
-        return PULL * float(np.linalg.norm(self.residuals(u, j))) / math.sqrt(self.n)
+        return PULL * float(np.linalg.norm(self.errors_at(u, j))) / math.sqrt(self.n)
 
     def equal(self, t: float) -> np.ndarray:
         """The numbers of equal steps without filters and force gradients."""
@@ -228,12 +213,12 @@ class SplitProblem:
 
     # all times ----------------------------------------------------------------------------------------------
 
-    def whole(self, u: np.ndarray, stop: Stop) -> Minimum:
+    def whole(self, u: np.ndarray, deadline: Deadline) -> Minimum:
         """The polynomials, put through numbers followed from time to time, then fitted to all labels."""
         last = len(self.t) - 1
-        followed = self.follow(self.equal(self.t[0]), range(last + 1), stop)
-        if np.linalg.norm(self.residuals(followed[last], last)) > WORSE * np.linalg.norm(self.residuals(u, last)):
-            followed = self.follow(u, range(last, -1, -1), stop)[::-1]
+        followed = self.follow(self.equal(self.t[0]), range(last + 1), deadline)
+        if np.linalg.norm(self.errors_at(followed[last], last)) > WORSE * np.linalg.norm(self.errors_at(u, last)):
+            followed = self.follow(u, range(last, -1, -1), deadline)[::-1]
         pulls = np.array([self.pull(v, j) for j, v in enumerate(followed)])
         offsets, designs = self.polynomials()
         scale = np.array([self.units(t) for t in self.t])
@@ -243,11 +228,11 @@ class SplitProblem:
         theta = np.linalg.lstsq(A, np.concatenate([b, np.zeros(A.shape[1])]), rcond=None)[0]
         weight = np.where(np.arange(len(self.t)) == len(self.t) - 1, self.fit.frozen_weight, 1.0)
         fit = Pulled(self, range(len(self.t)), offsets, designs, weight / math.sqrt(len(self.t)), pulls)
-        m = levenberg_marquardt(fit.residuals, fit.linearized, theta, iterations=self.solver.steps, stop=stop)
+        m = fit.minimize(theta, self.solver.steps, deadline)
         self.assign(m.x)
         return m
 
-    def follow(self, u: np.ndarray, order: range, stop: Stop) -> list[np.ndarray]:
+    def follow(self, u: np.ndarray, order: range, deadline: Deadline) -> list[np.ndarray]:
         """The numbers at the times in order, each from those at the time before, the first from u."""
         followed: list[np.ndarray] = []
         for j in order:
@@ -255,7 +240,7 @@ class SplitProblem:
                 before = j - order.step
                 u = followed[-1] * self.units(self.t[j]) / self.units(self.t[before])
             for _ in range(2):  # the second time with the pull that suits the error reached
-                u = self.minimize(u, j, FOLLOWING, stop, self.pull(u, j)).x
+                u = self.fitted(u, j, FOLLOWING, deadline, self.pull(u, j)).x
             followed.append(u)
         return followed
 
@@ -272,7 +257,7 @@ class SplitProblem:
     def differences(self, j: int) -> np.ndarray:
         """ψ̄_t(x) − φ_H,t(x) in modes, at the held-out states and the j-th of their times: (N, 2d)."""
         t, z = self.held_out.t, self._modes(self.held_out.x)
-        return self.kernel.step_modes(self.flow.numpy_maps(np.array(t[j])), z) - self._modes(self.held_out.y[j])
+        return self.kernel.step_modes(self.flow.frozen().maps(float(t[j])), z) - self._modes(self.held_out.y[j])
 
     def missed(self) -> tuple[float, float]:
         """See `shares_missed`: at the last of the held-out times, which is next to Δt."""

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import copy
 import math
-import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, ClassVar
@@ -18,6 +17,7 @@ import numpy as np
 import torch
 from scipy.linalg import null_space
 
+from sympflow.arguments import warn
 from sympflow.flow.coefficients import Coefficients
 from sympflow.flow.primed import PrimedFlow
 from sympflow.flow.scaling import Scaling
@@ -123,13 +123,12 @@ class TableRun(SearchRun):
                 slope = energy_slope(system, labels, options.energy_weight)
                 self._fit_frozen(labels, slope)
         if options.residual_weight or options.matching_weight or data is not None:
-            system.check_autonomous(
-                "and losses at points compare a table at no time of it", "fit it to labels, loss='labels'"
-            )
             rest = options.label_weight if data is not None else 0.0
             loss = Loss(system, scaling, options.residual_weight, options.matching_weight, rest)
             shape = (flow.dt, options.loss_points, options.matching_times, options.seed, flow.dtype, flow.device)
-            points_at = PointSource(domain, *shape, block=1)(0)._replace(labels=_tensors(data) if rest else None)
+            points_at = PointSource(domain, *shape, block=1)(0)
+            if rest:
+                points_at = points_at._replace(labels=tuple(torch.as_tensor(a, dtype=torch.float64) for a in data))
             parts.append((1.0, LossProblem(table, Objective(loss, flow, points_at))))
         t = np.append(flow.dt * (np.arange(fractions) + 0.5) / fractions, flow.dt)
         unseen = system, domain, options.reference_states, options.seed, Stream.REFERENCE, t
@@ -154,20 +153,15 @@ class TableRun(SearchRun):
         return self.frozen or self.whole
 
     @property
-    def most_steps(self) -> int:
-        """Iterations of each of the final fits."""
-        return self.solver.steps
-
-    @property
     def search_steps(self) -> int:
-        return min(SEARCH_STEPS, self.most_steps)
+        return min(SEARCH_STEPS, self.solver.steps)
 
     def found(self, minimum: Minimum) -> dict[str, float]:
         self.table.assign(self._continued(min(self.minima, key=lambda m: m.cost)))
         return self._record(minimum)
 
     def complete(self, session: Session) -> None:
-        finalists, frozen, steps = _distinct(self.minima)[:FINALISTS], self.frozen, self.most_steps
+        finalists, frozen, steps = _distinct(self.minima)[:FINALISTS], self.frozen, self.solver.steps
         if frozen is not None:
             for fit in filter(None, (frozen, self.weighted)):
                 common = (fit, steps, self._frozen_end, True)
@@ -186,7 +180,7 @@ class TableRun(SearchRun):
         self.table.assign(best.x)
         self._record(best, self._keep_better(session))
 
-    def _completed_by_runs(self, session: Session, runs: RunsFit, finalists: list[Minimum]) -> bool:
+    def _completed_by_runs(self, session: Session, runs: Any, finalists: list[Minimum]) -> bool:
         """Fit the finalists to long runs and take the best; False, with a warning, where there are none to compare."""
         labels = self.weighted or self.frozen
         assert labels is not None
@@ -195,10 +189,10 @@ class TableRun(SearchRun):
         late = self.whole_end.over()
         if late or not tables:
             reason = "the time was up" if late else "those of the flow do not stay finite: take a shorter `dt`"
-            warnings.warn(f"The flow was not fitted to `runs`, because {reason}.", RuntimeWarning, stacklevel=8)
+            warn(f"The flow was not fitted to `runs`, because {reason}.", RuntimeWarning)
             self.runs = None
             return False
-        common = both, min(self.most_steps, RUN_STEPS), self.whole_end, False
+        common = both, min(self.solver.steps, RUN_STEPS), self.whole_end, False
         best = min(session.each(descended, common, tables, self.whole_end, both.compiled), key=lambda m: m.cost)
         theta = runs.parameters(best.x)
         if self.fit.label_times >= self.flow.shape.degree:  # fewer would leave the polynomials open in between
@@ -286,12 +280,11 @@ class TableRun(SearchRun):
         self.kept_start = True
         if session.interruption.asked or after < CLOSE * before:  # as when a fit is fitted again
             return self.at_start
-        warnings.warn(
+        warn(
             f"The fit has a larger held-out error ({after:.1e}, in units of the spread of `domain`) than the flow that "
             f"it started from ({before:.1e}), which is returned: its data are too few, too far from Δt, or not of this "
             "system; or H is singular in `domain`, nearly so, or has a kink: shrink that.",
             RuntimeWarning,
-            stacklevel=7,
         )
         return self.at_start
 
@@ -356,10 +349,6 @@ def _distinct(minima: list[Minimum]) -> list[Minimum]:
     return kept
 
 
-def _tensors(data: tuple[np.ndarray, ...] | None) -> Any:
-    return None if data is None else tuple(torch.as_tensor(a, dtype=torch.float64) for a in data)
-
-
 # least squares ------------------------------------------------------------------------------------------------------
 
 
@@ -381,17 +370,8 @@ class StackedFit(Problem):
         return np.concatenate([w * r for w, r, _ in pieces]), np.concatenate([w * J for w, _, J in pieces])
 
 
-class RunsFit(Problem):
-    """Errors in long runs by the frozen parameters of a table."""
-
-    record: dict[str, Any]
-
-    def parameters(self, theta: np.ndarray) -> np.ndarray:
-        """The flow's parameters that make the table of `theta` at Δt."""
-        raise NotImplementedError
-
-
-MadeRuns = Callable[[PrimedFlow], RunsFit]
+MadeRuns = Callable[[PrimedFlow], Any]
+"""Errors in long runs by the frozen parameters of a flow's table: see `sympflow.training.lattice_fit.EnergyRuns`."""
 
 
 class Restricted(Problem):
@@ -487,11 +467,9 @@ class Table:
         kicks = [i for i, kind in enumerate(flow.sequence) if kind == "kick"]
         n = len(flow.sequence)
         self.n = n + flow.terms * len(kicks)
-        named = [flow.kicks, flow.drifts, flow.gradients, flow.curvatures, *(flow.polynomials or ())]
-        outside = [flow.processor_kicks, flow.processor_drifts, flow.processor_gradients, flow.processor_curvatures]
-        outside += flow.processor_polynomials or ()
-        self.columns = [c for c in (*named, *outside) if c is not None]
-        self._kernel = len([c for c in named if c is not None])
+        named = dict(flow.columns())
+        self.columns = [*named.values()]
+        self._kernel = sum(not name.startswith("processor_") for name in named)
         self._places = [np.zeros((self.n, c.offset.shape[0])) for c in self.columns]
         index = {id(c): place for c, place in zip(self.columns, self._places, strict=True)}
         for i, substep in enumerate(flow.substeps):

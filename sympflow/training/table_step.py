@@ -1,7 +1,4 @@
-"""A splitting step and its derivatives with respect to the numbers of its table.
-
-The step needs the forces of a system and their Jacobians: F = −∇V, G = ∇²V v and C = −∇(½ v·∇²V v), with v = M⁻¹∇V; or
-after F the −∇q^m of each monomial. Arrays are feature-major: q and F, G, C are (d, P), Jacobians (d, d, P).
+"""A splitting step and its derivatives by the numbers of its table; arrays are feature-major: q (d, P).
 
 A driven system is the autonomous one of positions (q, t, s) and momenta (p, 1, E), with V(q, t + s), M⁻¹ extended by 1
 for the velocity of t in drifts, by 0 in v and for s, which stays 0, and the forces (−∂V/∂q, 0, −∂V/∂t). So the
@@ -12,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -58,7 +55,7 @@ class TableStep:
         self.balanced = self._driven and not system.friction
         self._times_inverse_mass, self._friction = partial(_velocity, system, 1.0), system.friction
         if self._driven and system.friction:
-            self._friction = Friction(_extended(system.friction.matrix(system.ndof), 0.0))
+            self._friction = Friction(np.pad(system.friction.matrix(system.ndof), (0, 2)))  # none of t and s
         self._forces_of = system, level, monomials, compiled
         n, terms = len(sequence), len(monomials) or level
         kicks = [i for i in range(n) if sequence[i] == "kick"]
@@ -76,7 +73,7 @@ class TableStep:
             self.loops = table_loops(system.form, each, int(level), monomials, system.friction)
 
     @cached_property
-    def _forces(self) -> Forces:
+    def _forces(self) -> Any:
         return forces_of(*self._forces_of)
 
     def _opened(self, y: np.ndarray, t0: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
@@ -125,10 +122,6 @@ class TableStep:
         mean, end = self._friction.drift(p.swapaxes(-1, -2), s[:, None])
         return self._velocity(mean.swapaxes(-1, -2)), end.swapaxes(-1, -2)
 
-    def _slowing(self, p: np.ndarray) -> np.ndarray:
-        """−Γp of momenta (d, P), their rate in a drift."""
-        return np.zeros_like(p) if not self._friction else self._friction.force(p.T).T
-
     def errors(self, *given: Any) -> LabelErrors | ArrayErrors:
         """Weighted errors of labels after a step: see `LabelErrors`."""
         return ArrayErrors(self, *given) if self.loops is None else self.loops.errors(*given)
@@ -148,7 +141,8 @@ class TableStep:
                 change, p = self._drifted(p, c[i])
                 q = q + change
                 by_q[i] += self._velocity(p)
-                by_p[i] += self._slowing(p)
+                if self._friction:
+                    by_p[i] += self._friction.force(p.T).T
                 moved.append(i)
             else:
                 forces, changes = self._changes(q, by_q[moved])
@@ -201,16 +195,8 @@ class ArrayErrors:
         return split.swapaxes(-2, -3).reshape(*errors.shape[:-2], -1)
 
 
-def _extended(matrix: np.ndarray, of_time: float) -> np.ndarray:
-    """A matrix (d, d) with rows and columns of t and s, 0 but for one entry."""
-    d = len(matrix)
-    extended = np.zeros((d + 2, d + 2))
-    extended[:d, :d], extended[d, d] = matrix, of_time
-    return extended
-
-
 def _velocity(system: HamiltonianSystem, of_time: float, p: np.ndarray) -> np.ndarray:
-    """M⁻¹p of rows (..., D), extended likewise."""
+    """M⁻¹p of rows (..., D), that of t times a number, and 0 for s."""
     d = system.ndof
     return np.concatenate([system.velocity(p[..., :d]), of_time * p[..., d : d + 1], 0 * p[..., d + 1 :]], axis=-1)
 
@@ -218,17 +204,7 @@ def _velocity(system: HamiltonianSystem, of_time: float, p: np.ndarray) -> np.nd
 # forces ---------------------------------------------------------------------------------------------------------
 
 
-class Forces(Protocol):
-    """The terms of a kick, as many as the kicks have: F, then G and C, or those of monomials."""
-
-    def values(self, q: np.ndarray) -> Sequence[np.ndarray]:
-        """The terms: (d, P) each."""
-
-    def along(self, q: np.ndarray, v: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray]]:
-        """The terms, and their derivatives along directions v (k, d, P), of the same shape."""
-
-
-def forces_of(system: HamiltonianSystem, level: int, monomials: Monomials = (), compiled: bool = False) -> Forces:
+def forces_of(system: HamiltonianSystem, level: int, monomials: Monomials = (), compiled: bool = False) -> Any:
     """The forces of a separable system with T = ½ pᵀM⁻¹p: compiled ones of pairs, else those of its functions."""
     if compiled and system.local is not None and system.local.loops == "pairs":
         from sympflow.kernels.pairs import PairForces
@@ -238,7 +214,10 @@ def forces_of(system: HamiltonianSystem, level: int, monomials: Monomials = (), 
 
 
 class ArrayForces:
-    """The terms by the functions of a system; derivatives of ∇²V along v = M⁻¹∇V, and of C, are differences."""
+    """The terms of a kick by the functions of a system; derivatives of ∇²V along v = M⁻¹∇V, and of C, are differences.
+
+    They are as many as the kicks have: F, then G and C, or those of monomials.
+    """
 
     def __init__(self, system: HamiltonianSystem, level: int, monomials: Monomials = ()) -> None:
         self._given = system, level, monomials
@@ -253,12 +232,14 @@ class ArrayForces:
         return ArrayForces, self._given
 
     def values(self, q: np.ndarray) -> Sequence[np.ndarray]:
+        """The terms: (d, P) each."""
         rows = np.ascontiguousarray(q.T)
         slope = self._gradient(rows)
         G = [self._product(rows, self._velocity(slope)).T] if self._has_gradient else []
         return [-slope.T, *G, *(-term(rows).T for term in self._terms)]
 
     def along(self, q: np.ndarray, v: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray]]:
+        """The terms, and their derivatives along directions v (k, d, P), of the same shape."""
         rows, directions = np.ascontiguousarray(q.T), np.ascontiguousarray(v.swapaxes(-1, -2))  # (k, P, d)
         slope, changes = self._gradient(rows), [-self._product(rows, directions)]
         if self._has_gradient:

@@ -23,29 +23,9 @@ from sympflow.hamiltonian.fingerprint import check_for_flows
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.systems.given import GivenSystem, given_system
 from sympflow.training import checkpoint as checkpoints
-from sympflow.training import trials
+from sympflow.training import fits, trials
 from sympflow.training.clock_fit import train_clock
-from sympflow.training.fits import (
-    FITTED,
-    KINDS,
-    OF_NETWORKS,
-    OF_PRIMED,
-    OF_SEARCHES,
-    WEIGHTS,
-    Adam,
-    ClockedFit,
-    Fit,
-    GaussNewton,
-    KeplerFit,
-    LossFit,
-    NetworkFit,
-    PrimedFit,
-    Solver,
-    SplitFit,
-    from_keywords,
-    keywords,
-    said,
-)
+from sympflow.training.fits import ClockedFit, Fit, GaussNewton, KeplerFit, LossFit, NetworkFit, PrimedFit, Solver
 from sympflow.training.lattice_fit import LatticeSubsystem, by_subsystem, check_runs, runs_of
 from sympflow.training.network_fit import LossRun
 from sympflow.training.planet_fit import can_train, train_planets
@@ -179,7 +159,7 @@ def train(
             raise TypeError(f"`{name}` is not an option of flows of kind {kind!r}: leave it out.")
         fit, options = KeplerFit(**{name: plain(x) for name, x in options.items()}), {}
     if fit is None or not isinstance(fit, Fit):
-        fit, solver, start = _described(system, fit, solver, flow, said(options))
+        fit, solver, start = _described(system, fit, solver, flow, fits.said(options))
     elif options:
         raise TypeError(f"`{next(iter(options))}` was given beside `fit`: make it an option of that.")
     return fit_flow(system, flow, fit, solver, domain, session, start)
@@ -223,7 +203,7 @@ def fit_flow(
             runs = None if fit.runs is None else partial(runs_of, few, fit.runs, fit.seed)
             fitted = _fitted(few.system, small, kind, replace(fit, runs=None), solver, few.domain, session, runs)
             return few.whole(fitted)
-    if not (primed or isinstance(fit, SplitFit) or session.pool.alone):
+    if not (primed or isinstance(fit, fits.SplitFit) or session.pool.alone):
         raise TypeError(
             "`workers` share the starts of a search by 'gauss-newton' for primed and split flows, and this fit is one "
             "run of steps: leave it out."
@@ -281,7 +261,7 @@ def _fitted(
 def _refuse_unknown(options: dict[str, Any]) -> None:
     """Raise if there are options that `train` does not have, with what may be meant."""
     arguments = [each for each in inspect.signature(train).parameters if each not in ("system", "options")]
-    known = [*arguments, "time_budget", *keywords()]
+    known = [*arguments, "time_budget", *fits.keywords()]
     for name, value in options.items():
         if name in known:
             continue
@@ -327,9 +307,9 @@ def _domain_for(system: HamiltonianSystem, domain: Domain | None) -> Domain:
 
 def _solver_for(fit: Fit, solver: Solver | None) -> Solver:
     """The solver that is given, or the default of a fit."""
-    searches = isinstance(fit, PrimedFit | SplitFit)
+    searches = isinstance(fit, PrimedFit | fits.SplitFit)
     if solver is None:
-        return GaussNewton() if searches else Adam()
+        return GaussNewton() if searches else fits.Adam()
     if searches and not isinstance(solver, GaussNewton):
         raise TypeError(
             f"`solver` of {type(fit).__name__} is GaussNewton; for {type(solver).__name__} pass LossFit() with a flow, "
@@ -349,7 +329,7 @@ def _described(
         raise TypeError(f"`fit` must be a fit of sympflow.training, such as PrimedFit(); got {fit!r}: or Δt, a number.")
     dt, by = options.get("dt"), options.pop("optimizer", None) if solver is None else solver.name
     searches = by in (None, GaussNewton.name)
-    kind, of_flow = options.pop("kind", None), (*OF_PRIMED, *OF_NETWORKS, "dtype", "device")
+    kind, of_flow = options.pop("kind", None), (*fits.OF_PRIMED, *fits.OF_NETWORKS, "dtype", "device")
     if flow is not None:
         if not isinstance(flow, FlowMap):
             raise TypeError(f"`flow` must be a SympFlow or an MLPFlow; got {flow!r}: leave it out for a new one.")
@@ -360,17 +340,17 @@ def _described(
         options.pop("dt", None)
         kind = _kind_of(flow)
     else:
-        named = ["kind"] * (kind is not None) + [n for n in options if n in (*OF_PRIMED, *OF_SEARCHES)]
+        named = ["kind"] * (kind is not None) + [n for n in options if n in (*fits.OF_PRIMED, *fits.OF_SEARCHES)]
         kind = _meant(system, options, searches) if kind is None else kind
-        check_one_of("kind", kind, (*KINDS, KeplerFit.kind))
-        for name in (n for n in options if n in (OF_NETWORKS if kind == "primed" else OF_PRIMED)):
+        check_one_of("kind", kind, (*fits.KINDS, KeplerFit.kind))
+        for name in (n for n in options if n in (fits.OF_NETWORKS if kind == "primed" else fits.OF_PRIMED)):
             raise TypeError(f"`{name}` is not an option of flows of kind {kind!r}: leave it out.")
         if kind == "primed":
             _check_primable(system, named, searches)
     start = None
     if kind == "primed" and flow is None and not searches:
         start = PrimedFit(**{n: options.pop(n) for n in PrimedFit.of_flow() if n in options})
-    made, found = from_keywords(options, kind, by, flow)
+    made, found = fits.from_keywords(options, kind, by, flow)
     if solver is not None and (twice := [name for name in options if name in found.names()]):
         raise TypeError(f"`{twice[0]}` was given beside `solver`: make it an option of that.")
     return made, found if solver is None else solver, start
@@ -386,25 +366,25 @@ def _of_planets(system: HamiltonianSystem, fit: Any, flow: Any, solver: Any, opt
 
 def _kind_of(flow: FlowMap) -> str:
     """The kind of a given flow."""
-    return next((fit.kind for family, fit in FITTED if isinstance(flow, family)), flow.kind)
+    return next((fit.kind for family, fit in fits.FITTED if isinstance(flow, family)), flow.kind)
 
 
 def _meant(system: HamiltonianSystem, options: dict[str, Any], searches: bool) -> str:
     """The kind that is meant where none is named."""
-    searched = [name for name in options if name in OF_SEARCHES]
-    fits = system.separable and system.quadratic_kinetic
-    if searched and not fits:
+    searched = [name for name in options if name in fits.OF_SEARCHES]
+    suitable = system.separable and system.quadratic_kinetic
+    if searched and not suitable:
         raise ValueError(
             f"`{searched[0]}` is of the search for primed flows by Gauss–Newton, which needs H = ½ pᵀM⁻¹p + V(q); "
             f"{system.name!r} is of another form: leave it out for a network, or pass kind='primed', optimizer='bfgs'."
         )
-    if searched or any(name in OF_PRIMED for name in options):
+    if searched or any(name in fits.OF_PRIMED for name in options):
         return "primed"
     of_search = {*PrimedFit.names(), "steps", "restarts"} - {"dtype", "device"}
     of_networks = [name for name in options if name not in of_search]
     if "loss" not in options:
-        of_networks += [name for name in (*WEIGHTS, "matching_times", "data") if name in options]
-    return "primed" if fits and searches and not of_networks else "sympflow"
+        of_networks += [name for name in (*fits.WEIGHTS, "matching_times", "data") if name in options]
+    return "primed" if suitable and searches and not of_networks else "sympflow"
 
 
 def _check_primable(system: HamiltonianSystem, given: list[str], searches: bool) -> None:
@@ -431,7 +411,7 @@ def _checked_kind(system: HamiltonianSystem, flow: FlowMap | None, fit: Fit) -> 
         if isinstance(fit, PrimedFit):
             _check_primable(system, ["fit"], True)
         return fit.kind
-    family = next((family for family, cls in FITTED if isinstance(fit, cls)), FlowMap)
+    family = next((family for family, cls in fits.FITTED if isinstance(fit, cls)), FlowMap)
     if not isinstance(flow, family) or isinstance(fit, NetworkFit | ClockedFit | KeplerFit):
         raise TypeError(
             f"`fit` {type(fit).__name__} is not one of a given {type(flow).__name__}: pass LossFit(), or leave it out."
@@ -495,7 +475,7 @@ def _run_of(
     dt = flow.dt if flow is not None else 1.0 if fit.dt is None else float(fit.dt)
     labels, scaling = None, None
     try:
-        if isinstance(fit, SplitFit):
+        if isinstance(fit, fits.SplitFit):
             return SplitRun(flow, system, domain, scaling, fit, solver, deadline)
         if fit.data is not None:
             labels = handed_in(fit.data, system, dt)

@@ -41,7 +41,7 @@ def test_a_store_holds_the_result(tmp_path, reduce):
 
 
 def test_a_run_goes_on_where_it_ended(tmp_path, monkeypatch):
-    path, written = tmp_path / "a.zarr", storage._replace
+    path, written = tmp_path / "a.zarr", storage.put_file
     left = 2
 
     def full(place, data, durable=True):
@@ -51,10 +51,10 @@ def test_a_run_goes_on_where_it_ended(tmp_path, monkeypatch):
             raise OSError(errno.ENOSPC, "No space left on device")
         written(place, data, durable)
 
-    monkeypatch.setattr(storage, "_replace", full)
+    monkeypatch.setattr(storage, "put_file", full)
     with pytest.raises(OSError, match=r"`store` .* cannot be written \(No space left on device\)"):
         run(store=path)
-    monkeypatch.setattr(storage, "_replace", written)
+    monkeypatch.setattr(storage, "put_file", written)
     done = {file.name: file.stat().st_mtime_ns for file in (path / "status").iterdir() if file.name[0] != "."}
     assert len(done) == 1
     waiting = np.arange(len(STATES)) >= 64

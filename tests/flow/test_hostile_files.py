@@ -102,10 +102,7 @@ FILES = {
     "a ragged tube": (lambda f: described(f, domain=tube(orbit=[[0.0, 0.0], [1.0]])), INADMISSIBLE),
     "a tube of deep lists": (lambda f: described(f, domain=tube(orbit=[[[0.0, 0.0]]])), INADMISSIBLE),
     "a tube of words": (lambda f: described(f, domain=tube(orbit="ab")), INADMISSIBLE),
-    "a tube of half indices": (
-        lambda f: described(f, domain=tube(groups=[[0.5], [1]])),
-        INADMISSIBLE,
-    ),
+    "a tube of half indices": (lambda f: described(f, domain=tube(groups=[[0.5], [1]])), INADMISSIBLE),
     "a tube without radius": (lambda f: described(f, domain=tube(radius=0.0)), INADMISSIBLE),
     "a shell that is none": (
         lambda f: described(f, domain={"kind": "EnergySublevel", "energy": 1.0, "box": BOX, "above": 2.0}),

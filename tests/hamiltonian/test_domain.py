@@ -34,7 +34,7 @@ DOMAINS = [
 
 
 @pytest.mark.parametrize("domain", DOMAINS, ids=lambda d: type(d).__name__)
-@settings(deadline=None)
+@settings(deadline=None, max_examples=20)
 @given(seed=st.integers(0, 2**31), n=st.integers(1, 300))
 def test_samples_lie_inside_and_depend_on_the_seed_only(domain, seed, n):
     x = domain.sample(n, seed)

@@ -54,7 +54,7 @@ def test_it_is_as_exact_as_its_conditioning_allows(e):
     """The error is at most a few times what a change of the data by half a unit in their last places makes."""
     rng = np.random.default_rng(1)
     with mp.workdps(60):
-        for k in range(6):
+        for k in range(4):
             mu = rng.uniform(0.5, 2)
             q = rng.uniform(0.2, 2) if e <= 0.99 or k % 2 else max(abs(1 - e), 1e-12)
             start = [q, 0.0, 0.0], [0.0, np.sqrt(mu * (1 + e) / q), 0.0]

@@ -51,9 +51,10 @@ def weighted(sol):
     return (torch.as_tensor(sol.y) * torch.as_tensor(np.random.default_rng(1).normal(size=sol.y.shape))).sum()
 
 
-@pytest.mark.parametrize(("system", "method"), SYSTEMS)
-@pytest.mark.parametrize("run", RUNS)
-@pytest.mark.parametrize("batch", [(), (2, 9)])
+@pytest.mark.parametrize(
+    ("system", "method", "run", "batch"),
+    [(*of, RUNS[(i + k) % 4], batch) for i, of in enumerate(SYSTEMS) for k, batch in enumerate([(), (2, 9)])],
+)
 def test_values_are_those_of_arrays_and_gradients_those_of_backpropagation(system, method, run, batch):
     y0, found = start(system, batch), {}
     plain = solve(system, method, y0=y0, **run)
@@ -301,8 +302,9 @@ def network(kind):
 
 
 @pytest.mark.parametrize("kind", ["two layers", "one layer", "coordinates"])
-@pytest.mark.parametrize(("method", "run"), [("verlet", RUNS[0]), ("kahan_li8", RUNS[2]), ("verlet", RUNS[3])])
-@pytest.mark.parametrize("batch", [(), (3, 7)])
+@pytest.mark.parametrize(
+    ("method", "run", "batch"), [("verlet", RUNS[0], ()), ("kahan_li8", RUNS[2], (3, 7)), ("verlet", RUNS[3], (3, 7))]
+)
 def test_weights_of_a_network_in_H(kind, method, run, batch):
     net, V = network(kind)
     system = HamiltonianSystem(V, ndof=2, mass=[1.0, 2.0])

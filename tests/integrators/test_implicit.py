@@ -87,7 +87,7 @@ def test_compiled_and_array_agree_to_rounding(method):
     np.testing.assert_allclose(compiled.y, array.y, rtol=0, atol=100 * 50 * EPS)
 
 
-@pytest.mark.parametrize(("method", "backend"), [*((m, "array") for m in METHODS), (METHODS[1], "auto")])
+@pytest.mark.parametrize(("method", "backend"), [(METHODS[0], "array"), (METHODS[1], "auto")])
 def test_newtons_failure_is_status_minus_one_with_the_time(method, backend):
     hh = systems.henon_heiles()
     sol = solve(hh, method, (0.0, 10.0), y0=[0.0, 0.0, 0.0, 0.7], dt=0.05, backend=backend)

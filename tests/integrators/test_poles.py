@@ -83,7 +83,7 @@ def of_functions(V):
     return HamiltonianSystem(lambda q: potential(q[..., 0]), ndof=1)
 
 
-@pytest.mark.parametrize("V", CROSSED)
+@pytest.mark.parametrize("V", [*CROSSED][::2])
 def test_a_run_of_functions_ends_there_too(V):
     y0, dt, t1 = CROSSED[V]
     sols = [solved(f, "verlet", (0, t1), y0, dt=dt)[0] for f in (of_functions(V), in_units(V, 1.0))]
@@ -196,8 +196,10 @@ def test_two_bodies_on_a_line_do_not_pass_each_other():
     assert "passed q1 - q2 = 0" in sol.message
 
 
-@pytest.mark.parametrize("dim", [1, 2, 3])
-@pytest.mark.parametrize(("V", "speed"), [("1/r", 30.0), ("-m1*m2/r", 30.0), ("1/r**12 - 1/r**6", 30.0), ("-1/r", 0.0)])
+@pytest.mark.parametrize(
+    ("dim", "V", "speed"),
+    [(1, "1/r", 30.0), (2, "-m1*m2/r", 30.0), (3, "1/r**12 - 1/r**6", 30.0), (2, "-1/r", 0.0), (3, "1/r", 30.0)],
+)
 def test_two_bodies_in_space_do_not_pass_each_other(dim, V, speed):
     """Head-on, along a line of any direction; and beside each other they may."""
     u, across = np.array([[3.0, 1.0, -2.0], [1.0, -3.0, 0.0]])[:, :dim] / np.sqrt([9.0, 10.0, 14.0][dim - 1])
@@ -311,8 +313,13 @@ def test_a_warning_of_a_leap_names_the_parameters():
         sf.solve(system, "verlet", (0, 3), [1, 0, 0, 0.05], dt=0.01, params={"k": np.array([-3.0, 1.0])})
 
 
-@pytest.mark.parametrize("more", [{}, {"save_every": 20}, {"t_eval": [0.5, 1.0, 6.0]}])
-@pytest.mark.parametrize("y0", [[1.0, 0.0], [5.0, 3.0], [[1.0, 0.0], [5.0, 3.0], [2.0, 0.0]]])
+BATCH = [[1.0, 0.0], [5.0, 3.0], [2.0, 0.0]]
+
+
+@pytest.mark.parametrize(
+    ("y0", "more"),
+    [(BATCH[0], {}), (BATCH[1], {"save_every": 20}), (BATCH, {"save_every": 20}), (BATCH, {"t_eval": [0.5, 1.0, 6.0]})],
+)
 def test_stored_runs_are_looked_after(tmp_path, y0, more):
     system = HamiltonianSystem.from_sympy("p**2/2 - 1/Abs(q)")
     kept = sf.solve(system, "verlet", (0, 6), y0, dt=0.07, **more)

@@ -74,7 +74,7 @@ class TestValues:
 
 
 @pytest.mark.parametrize(
-    ("method", "t"), [(name, t) for name in KINDS for t in ((0.0, 0.25, 0.31), (0.2, -0.13, -0.39))]
+    ("method", "t"), [(name, ((0.0, 0.25, 0.31), (0.2, -0.13, -0.39))[i % 2]) for i, name in enumerate(KINDS)]
 )
 def test_gradients_to_y0_and_t(method, t):
     """At times between grid points, where ψ is smooth in t; a time on the grid has the slope of the step there."""
@@ -85,7 +85,7 @@ def test_gradients_to_y0_and_t(method, t):
 
 @pytest.mark.parametrize("t", [(0.0, 0.25, 1.2), (0.2, -0.13, -1.4)])
 def test_gradients_of_a_flow_to_y0_t_and_weights(t):
-    psi = flow()
+    psi = SympFlow(1, hidden=(2,), dt=0.5)
     y0 = torch.tensor([[1.0, 0.2], [0.3, -0.4]], dtype=torch.float64, requires_grad=True)
 
     def states(y, s, *weights):

@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 import torch
+from conftest import KINDS
 
 torchode = pytest.importorskip("torchode", reason="torchode is an optional peer: pip install torchode")
 
-from sympflow import SympFlow, available, get, solve, systems  # noqa: E402
+from sympflow import SympFlow, get, solve, systems  # noqa: E402
 from sympflow.integrators.base import FixedStep  # noqa: E402
 from sympflow.interop.torchode import register, step_method  # noqa: E402
 
@@ -28,12 +29,7 @@ def run(method, y0, t_eval, dt, **arguments):
     )
 
 
-CLASSICAL = [
-    name
-    for name in available()
-    if issubclass(get(name), FixedStep) and get(name).on_grid and name not in ("sympflow", "mlp")
-    if getattr(get(name), "splitting", "") != "kepler"  # of planets
-]
+CLASSICAL = [name for name in KINDS if issubclass(get(name), FixedStep) and get(name).on_grid and not get(name).trained]
 
 
 @pytest.mark.parametrize(("name", "dt"), [*((name, 0.1) for name in CLASSICAL), ("kahan_li8", 0.25), ("sympflow", 1.0)])
@@ -68,7 +64,7 @@ def test_a_step_away_from_the_end_is_refused():
 
 
 def test_gradients_to_y0_t_and_weights():
-    flow = SympFlow(1, hidden=(5,), dt=0.5)
+    flow = SympFlow(1, hidden=(2,), dt=0.5)
     y0 = torch.tensor([[1.0, 0.2], [0.3, -0.4]], dtype=torch.float64, requires_grad=True)
     t = torch.tensor([[0.0, 0.3, 0.83], [0.1, 0.45, 1.33]], dtype=torch.float64, requires_grad=True)
     for method in (step_method("verlet", PENDULUM), step_method(flow, PENDULUM)):

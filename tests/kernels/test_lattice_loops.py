@@ -87,18 +87,15 @@ def test_lattices_of_every_kind(kind):
 @pytest.mark.parametrize(
     ("shapes", "boundary", "method"),
     [
-        *(((5, 8, 13, 40), boundary, "chin4c") for boundary in ("free", "fixed", "periodic")),
-        ((5, 8, 13, 40), "free", "verlet"),
-        *(
-            (((5, 8), (7, 13), (3, 18)), *each)
-            for each in (
-                (("free", "fixed"), "chin4c"),
-                (("fixed", "free"), "chin4c"),
-                (("periodic", "periodic"), "chin4c"),
-                (("fixed", "periodic"), "verlet"),
-                (("periodic", "free"), "verlet"),
-            )
-        ),
+        ((5, 8, 13, 40), "free", "chin4c"),
+        ((13, 40), "fixed", "chin4c"),
+        ((5, 8), "periodic", "chin4c"),
+        ((5, 40), "free", "verlet"),
+        (((5, 8), (7, 13), (3, 18)), ("free", "fixed"), "chin4c"),
+        (((3, 18),), ("fixed", "free"), "chin4c"),
+        (((7, 13),), ("periodic", "periodic"), "chin4c"),
+        (((5, 8), (3, 18)), ("fixed", "periodic"), "verlet"),
+        (((7, 13),), ("periodic", "free"), "verlet"),
     ],
 )
 def test_lattices_in_vector_registers(shapes, boundary, method):
@@ -133,9 +130,14 @@ def pieces(monkeypatch):
     monkeypatch.setattr(lattices, "WORTH_A_PIECE", 16)
 
 
-@pytest.mark.parametrize("method", ["verlet", "chin4c"])
-@pytest.mark.parametrize("shape", [270, 271, (40, 9), (9, 40), (9, 8, 5)])
-@pytest.mark.parametrize("boundary", ["periodic", "fixed", "free"])
+@pytest.mark.parametrize(
+    ("method", "shape", "boundary"),
+    [
+        (("verlet", "chin4c")[(i + k) % 2], shape, boundary)
+        for i, shape in enumerate([270, 271, (40, 9), (9, 40), (9, 8, 5)])
+        for k, boundary in enumerate(["periodic", "fixed", "free"])
+    ],
+)
 def test_pieces_and_threads_change_nothing(method, shape, boundary, pieces):
     """The state of a site is the same in all lanes and pieces, to the bit."""
     values = np.random.default_rng(5).uniform(0.5, 1.5, shape)
@@ -157,7 +159,7 @@ def test_widths_change_nothing(monkeypatch):
     system, runs = chain(48), []
     for width in (1, 2, 4, 8):
         monkeypatch.setattr(lattices, "arrangement", lambda lattice, width=width: ([0], width))
-        code = lattices.LatticeCode(system.local, SCHEMES["chin4c"].level, False, False)
+        code = lattices.LatticeCode(system.local, False, SCHEMES["chin4c"].level, False)
         runs.append(np.empty((1, 96)))
         code.mapped(single_table(SCHEMES["chin4c"], 0.1).packed, start(system, 1), runs[-1])
         np.testing.assert_array_equal(runs[-1], runs[0])

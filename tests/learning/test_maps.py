@@ -54,7 +54,7 @@ def learned():
     """Trajectories of H = ½p²(1 + q²/2) + ½q² + q⁴/8, which is not separable, and flows that are learned from them."""
     random, t = np.random.default_rng(0), np.linspace(0, 2.4, 13)
     data = []
-    for _ in range(40):
+    for _ in range(24):
         y0 = random.uniform(-0.8, 0.8, 2)
         y = solve_ivp(
             lambda t, y: [y[1] * (1 + 0.5 * y[0] ** 2), -y[0] - 0.5 * y[0] * y[1] ** 2 - 0.5 * y[0] ** 3],

@@ -153,7 +153,7 @@ def test_a_killed_run_goes_on_with_the_same_bits(tmp_path):
 
 @pytest.mark.parametrize("n_writes", [0, 1, 5, 9, 14, 23])
 def test_what_was_committed_before_the_disk_was_full_is_kept(tmp_path, monkeypatch, n_writes):
-    path, write, left = tmp_path / "run.zarr", storage._replace, [n_writes]
+    path, write, left = tmp_path / "run.zarr", storage.put_file, [n_writes]
 
     def full(*arguments, **options):
         left[0] -= 1
@@ -162,10 +162,10 @@ def test_what_was_committed_before_the_disk_was_full_is_kept(tmp_path, monkeypat
         return write(*arguments, **options)
 
     whole = solve(SYSTEM, "verlet", (0, END))
-    monkeypatch.setattr(storage, "_replace", full)
+    monkeypatch.setattr(storage, "put_file", full)
     with pytest.raises(StoreError, match=r"cannot be written .No space left on device.: what was committed is kept"):
         solve(SYSTEM, "verlet", (0, END), store=path, checkpoint_every=1e-9)
-    monkeypatch.setattr(storage, "_replace", write)
+    monkeypatch.setattr(storage, "put_file", write)
     if path.exists():
         n = Store.open(path).fields["time"].shape[0]
         np.testing.assert_array_equal(Store.open(path).read("q")[..., :n], whole.q[:, :n])

@@ -14,6 +14,7 @@ from sympflow.integrators.tableaux import ADAPTIVE
 HH, OSCILLATOR = systems.henon_heiles(), systems.harmonic_oscillator()
 
 
+@pytest.mark.filterwarnings("ignore:`dt` 0.05 is too long for method .euler.:RuntimeWarning")
 @pytest.mark.parametrize("method", KINDS)
 def test_the_crossings_are_those_that_events_find(method):
     def g(t, y):
@@ -30,8 +31,8 @@ def test_the_crossings_are_those_that_events_find(method):
 
 
 def test_all_zeros_of_cos_t_upwards_and_downwards(rotation):
-    zeros = np.pi * (np.arange(64) + 0.5)
-    for t_end in (200.0, -200.0):
+    zeros = np.pi * (np.arange(16) + 0.5)
+    for t_end in (50.0, -50.0):
         for direction, expected in ((0, zeros), (-1, zeros[0::2]), (1, zeros[1::2])):
             section = poincare_section(OSCILLATOR, rotation, (0.0, t_end), [1.0, 0.0], direction=direction)
             np.testing.assert_allclose(np.abs(section.t), expected, rtol=0, atol=1e-10)
@@ -59,7 +60,7 @@ def test_crossings_at_the_ends_of_steps_are_those_that_events_find():
     Not the last state of the run: rounding decides whether a run that ends on the plane has reached it.
     """
     run = solve(HH, "kahan_li8", (0, 60), dt=0.1)
-    for k in (*range(1, 600, 37), 55, 255, 256, 257):
+    for k in (*range(1, 600, 97), 55, 255, 256, 257):
         level = float(run.y[0, k])
         section = poincare_section(HH, "kahan_li8", (0, 60), level=level, direction=0, dt=0.1)
         sol = solve(HH, "kahan_li8", (0, 60), dt=0.1, t_eval=[], events=lambda t, y, level=level: y[0] - level)
@@ -257,10 +258,12 @@ TRAP = HamiltonianSystem.from_sympy(
 
 
 @pytest.mark.parametrize(
-    ("system", "energy"),
-    [(systems.henon_heiles(), 0.125), (systems.henon_heiles(), 0.01), (TRAP, 1e-21), (systems.pendulum(), 0.7)],
+    ("system", "energy", "direction"),
+    [
+        *((systems.henon_heiles(), 0.125, direction) for direction in (1, -1, 0)),
+        *((systems.henon_heiles(), 0.01, 1), (TRAP, 1e-21, -1), (systems.pendulum(), 0.7, 0)),
+    ],
 )
-@pytest.mark.parametrize("direction", [1, -1, 0])
 def test_orbits_of_one_energy_start_on_the_plane(system, energy, direction):
     span = system.t_span if system is TRAP else (0, 20 * system.dt)
     section = poincare_section(system, None, span, energy=energy, n=40, direction=direction)

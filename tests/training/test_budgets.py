@@ -91,8 +91,7 @@ def test_labels_that_take_too_long_are_a_message_with_what_was_reached(clock, ki
     clock.costs_seconds(Hamiltonian, "vector_field", 0.2)
     if kind == "primed":
         with pytest.warns(
-            RuntimeWarning,
-            match=r"^Training did not start because its labels .* share .*: the exact solution",
+            RuntimeWarning, match=r"^Training did not start because its labels .* share .*: the exact solution"
         ):
             flow = train(PENDULUM, flow=FLOW, time_budget=20.0, **QUICK)
         assert all(torch.equal(v, FLOW.state_dict()[k]) for k, v in flow.state_dict().items())

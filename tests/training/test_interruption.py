@@ -190,7 +190,7 @@ def test_once_a_trial_is_done_its_flow_is_there(monkeypatch, where):
     else:
         monkeypatch.setattr(trials, "tried_starts", lambda *_, **__: [start])
         monkeypatch.setattr(trials, "DEAREST", 0.0)
-        name = {"labels": "start", "search": "next_minimum"}[where]
+        name = {"labels": "prepare", "search": "next_minimum"}[where]
         then(monkeypatch, TableRun, name, interrupt, at=1 if where == "labels" else SHORT["STARTS"])
     with pytest.warns(RuntimeWarning, match=r"^Training .* because it was interrupted"):
         flow = train(PENDULUM, reference_states=10, progress=False)

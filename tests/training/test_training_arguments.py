@@ -50,12 +50,7 @@ NEW = {"kind": "sympflow", "pairs": 1, "hidden": (5,)}
 @pytest.mark.parametrize(
     ("system", "arguments", "error", "message"),
     [
-        (
-            W,
-            {"optimizer": "sgd"},
-            V,
-            f"^`optimizer` must be one of {', '.join(map(repr, SOLVERS))}; got 'sgd'",
-        ),
+        (W, {"optimizer": "sgd"}, V, f"^`optimizer` must be one of {', '.join(map(repr, SOLVERS))}; got 'sgd'"),
         (W, {"kind": "gan"}, V, "^`kind` must be one of 'primed', 'sympflow', 'mlp', 'kepler'; got 'gan'"),
         (W, {"schedule": "hope"}, V, "^`schedule`"),
         (W, {"dt": 0.0}, V, "^`dt`"),

@@ -25,19 +25,9 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.time_transformation import time_transformed
 from sympflow.solver import solve
 from sympflow.systems import SYSTEMS, duffing, fput, harmonic_oscillator, phi4, sine_gordon, spring_pendulum
+from sympflow.training import fits
 from sympflow.training.clock_fit import train_clock
-from sympflow.training.fits import (
-    SOLVERS,
-    WEIGHTS,
-    ClockedFit,
-    Fit,
-    GaussNewton,
-    LossFit,
-    NetworkFit,
-    PrimedFit,
-    Solver,
-    SplitFit,
-)
+from sympflow.training.fits import ClockedFit, Fit, GaussNewton, LossFit, NetworkFit, PrimedFit, Solver, SplitFit
 from sympflow.training.session import Session
 from sympflow.training.shipped.judges import AsPublished, ByRuns, Judge, balance_errors, by_certificate, of_stiff
 from sympflow.training.trainer import fit_flow
@@ -124,13 +114,13 @@ class Recipe:
     def _stage(self, told: dict[str, Any], k: int) -> tuple[Fit, Solver]:
         cls, shape = self._shape()
         cls = LossFit if k and cls is NetworkFit else cls
-        left_out = {"data", "loss", *(WEIGHTS if cls is PrimedFit else ())}
+        left_out = {"data", "loss", *(fits.WEIGHTS if cls is PrimedFit else ())}
         options = {n: told[n] for n in cls.names() if told.get(n) is not None and n not in left_out}
         if cls is PrimedFit:
             options = {"energy_weight": 0.0, **options}  # as before there was one
         if not k:
             options |= shape
-        solver = SOLVERS.get(told["optimizer"], GaussNewton)
+        solver = fits.SOLVERS.get(told["optimizer"], GaussNewton)
         return cls(**options), solver(**{n: told[n] for n in solver.names() if told.get(n) is not None})
 
     def _shape(self) -> tuple[type[Fit], dict[str, Any]]:
