@@ -27,24 +27,7 @@ if TYPE_CHECKING:
 MOST_IN_SYMBOLS = 300  # operations
 _JUMPING = {"sign", "floor", "mod", "where", "lt", "le", "eq", "atan2"}
 _SINGULAR = {"div": 1} | dict.fromkeys(
-    (
-        "pow",
-        "log",
-        "log1p",
-        "tan",
-        "sqrt",
-        "acos",
-        "asin",
-        "acosh",
-        "atanh",
-        "gamma",
-        "lgamma",
-        "digamma",
-        "ellipk",
-        "bose",
-        "csch",
-    ),
-    0,
+    "pow log log1p tan sqrt acos asin acosh atanh gamma lgamma digamma ellipk bose csch".split(), 0
 )
 """The argument by which an operation is infinite or no number."""
 _AS_THEIR_ARGUMENTS = {"abs", "neg", "sqrt", "pow", "mul", "times"}
