@@ -33,9 +33,6 @@ QUICK = {
 }
 
 
-SHORT = {**QUICK, "restarts": 1, "steps": 10, "points": 30, "reference_states": 10}  # where the result is not judged
-
-
 def weights(flow):
     return torch.cat([w.reshape(-1) for w in flow.state_dict().values()])
 
