@@ -389,17 +389,6 @@ def test_the_weight_of_the_energy_counts():
     assert state < other_state
 
 
-def test_by_default_it_makes_a_primed_flow():
-    flow = train(PENDULUM, 0.5, **QUICK)
-    assert (flow.dt, flow.system) == (0.5, PENDULUM)
-    assert flow.processor
-    assert flow.figures["one_step_error"] < 1e-5
-
-
-def test_training_states_are_not_the_held_out_ones():
-    assert not np.array_equal(states(HH.domain, 3, 0, Stream.RESIDUAL), states(HH.domain, 3, 0, Stream.REFERENCE))
-
-
 # what a fit must not do -----------------------------------------------------------------------------------------
 
 
