@@ -18,7 +18,6 @@ pytestmark = pytest.mark.slow
 
 PENDULUM = systems.pendulum()
 OSCILLATOR = systems.harmonic_oscillator()
-HENON_HEILES = systems.henon_heiles()
 METHODS = sorted(m for m in NAMES if getattr(get(m), "splitting", "") != "kepler")
 FIXED = [m for m in METHODS if "dt" in get(m).options() and getattr(get(m), "on_grid", True) and not get(m).trained]
 SPLITTINGS = [m for m in FIXED if get(m).symplectic]
