@@ -283,7 +283,7 @@ class PairsHamiltonian(LocalHamiltonian):
         return self.box is None and not self.softening
 
     @cached_property
-    def poles(self) -> Poles | None:  # type: ignore[override]
+    def poles(self) -> Poles | None:
         return PairsPoles(self) or None
 
     def met(self, y: np.ndarray, together: bool = False) -> Iterator[tuple[Any, Any, np.ndarray, list[Any]]]:

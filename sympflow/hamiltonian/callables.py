@@ -43,10 +43,7 @@ CLOSE = 1e-9  # of the largest value
 
 
 class CallableHamiltonian(Definition):
-    """The functions of a system given by V(q) or H(q, p), as a program where they can be traced: `form`.
-
-    Those of a driven system take the time first: a float beside arrays, a tensor of one double beside tensors.
-    """
+    """The functions of a system given by V(q) or H(q, p), as a program where they can be traced: `form`."""
 
     library: str = ""  # "numpy" or "torch", whose arrays the functions take; "" if they fail on both
     untraced: str = ""
@@ -133,7 +130,7 @@ class CallableHamiltonian(Definition):
         return found
 
     @cached_property
-    def poles(self) -> TracedPoles | None:  # type: ignore[override]
+    def poles(self) -> TracedPoles | None:
         return None if self.form is None else TracedPoles(self.form) or None
 
     @cached_property

@@ -142,7 +142,6 @@ class Identity:
             i = int(finite[0]) if finite.size else 0
             return float(_energies(system, self.states[: i + 1])[i]), float(self.energies[i])
         read, state = _read(self.expression, system.ndof), _fixed_states(system.ndof)[:1]
-        assert read is not None
         return float(_energies(system, state)[0]), float(_energies(read, state)[0])
 
     def is_proved(self, system: Hamiltonian) -> bool:
@@ -212,7 +211,7 @@ def _energies(system: Hamiltonian, states: np.ndarray) -> np.ndarray:
 
 
 @lru_cache(maxsize=16)
-def _read(expression: str | None, ndof: int) -> Hamiltonian | None:
+def _read(expression: str | None, ndof: int) -> Any:
     """The H of a text in a file, read by a grammar and never executed; None if it is none of d degrees of freedom."""
     from sympflow.hamiltonian.hamiltonian import Hamiltonian
     from sympflow.hamiltonian.symbolic import SymbolicHamiltonian

@@ -97,10 +97,7 @@ class Entries:
 
 
 class TracedHamiltonian:
-    """The form of a system of Python functions, as `SymbolicHamiltonian` is that of a system of symbols.
-
-    The program is V of q, if it is `separable`, or H of q and p; of a driven system the time comes first.
-    """
+    """The form of a system of Python functions, as `SymbolicHamiltonian` is that of a system of symbols."""
 
     parameters: tuple[Variable, ...] = ()
     values: tuple[float, ...] = ()
@@ -114,8 +111,8 @@ class TracedHamiltonian:
         self.p = tuple(Variable(f"p{i + 1}") for i in range(ndof))
         self.time = Variable("t") if timed else None
         times = (self.time,) if self.time else ()
-        self.V: Formula | None = None
-        self.T: Formula | None = None
+        self.V: Any = None
+        self.T: Any = None
         self.inverse_mass: Entries | None = None
         if not separable:
             self.H = Formula(program, (*times, *self.q, *self.p))
@@ -128,7 +125,6 @@ class TracedHamiltonian:
 
     def _set_potential(self, V: Formula) -> None:
         T, n = self.T, len(V.variables)
-        assert T is not None
         variables = (*V.variables, *self.p)
         H = traced(lambda *x: [V.program(*x[:n])[0] + T.program(*x[n:])[0]], *(s.name for s in variables))
         self.V, self.H = V, Formula(H, variables)
@@ -178,7 +174,6 @@ class TracedHamiltonian:
     @cached_property
     def driving(self) -> TracedDriving:
         """The form with coefficients for what depends on the time alone."""
-        assert self.V is not None
         (V,), coefficients = without_time([self.V], self.time)
         form = copy.copy(self)
         form.time, form.parameters = None, tuple(coefficients)

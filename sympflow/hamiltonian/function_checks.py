@@ -28,10 +28,7 @@ REMEDY = "where all is as it should be, pass check=False to HamiltonianSystem."
 
 
 def probe_states(given: np.ndarray | None, domain: Domain | None, width: int) -> np.ndarray:
-    """States (n, width) at which functions are tested: the given ones, near these, and some of the domain.
-
-    Without any they are random numbers of size 1.
-    """
+    """States (n, width) at which functions are tested: the given ones, near these, and some of the domain."""
     rng = np.random.Generator(np.random.PCG64(20260102))
     found = []
     if given is not None:
@@ -49,10 +46,7 @@ def probe_states(given: np.ndarray | None, domain: Domain | None, width: int) ->
 
 
 def reach(states: np.ndarray, parts: int) -> np.ndarray:
-    """The least and the largest components (2, width) that a run may have without another test, by states tested.
-
-    They are `parts` halves of sizes of their own: q, or q and p.
-    """
+    """The least and the largest components (2, width) that a run may have without another test, by states tested."""
     low, high = states.min(0), states.max(0)
     with np.errstate(over="ignore"):
         lengths = (high - low).reshape(parts, -1)
@@ -83,8 +77,8 @@ class Tested:
 
     names: tuple[str, str, str]  # of the functions, and of the state, in messages
     value: Callable[[Array], Array]
-    gradient: Callable[[Array], Array] | None  # None of an exact one, of a function that was traced
-    hessian_vector: Callable[[Array, Array], Array] | None = None
+    gradient: Any  # None of an exact one, of a function that was traced
+    hessian_vector: Any = None
     automatic: bool = False  # the gradient is an automatic one
     parts: int = 1  # 2 if x is [q, p], two halves of sizes of their own
     result_types: Callable[[Array], list[tuple[str, Any]]] | None = None  # in which the user's own functions answer
@@ -184,10 +178,7 @@ def _check_batch(functions: Tested, name: str, x: Array, single: np.ndarray, bat
 
 
 def _directions(x: np.ndarray, chosen: Sequence[int] | None, parts: int, own: bool = False) -> np.ndarray:
-    """Directions (N, m, n) at states (N, n), of the size of these: those of chosen components, or random ones.
-
-    A small component is moved by a tenth of the largest, or, if it is not 0, by its `own` size.
-    """
+    """Directions (N, m, n) at states (N, n), of the size of these: those of chosen components, or random ones."""
     groups = np.abs(x).reshape(len(x), parts, -1)
     largest = groups.max(-1, keepdims=True)
     size = np.maximum(groups, 0.1 * np.where(largest > 0, largest, 1.0))
@@ -302,8 +293,6 @@ def _refuse(functions: Tested, state: Array, k: int, given: float, found: float,
 
 
 def _check_hessian_vector(functions: Tested, x: Array, g: np.ndarray) -> None:
-    assert functions.hessian_vector is not None
-    assert functions.gradient is not None
     name = "hessian_vector"
     v, claimed = _products(functions, x, own=False)
     if claimed.shape != g.shape:
@@ -328,7 +317,6 @@ def _check_hessian_vector(functions: Tested, x: Array, g: np.ndarray) -> None:
 
 def _products(functions: Tested, x: Array, own: bool) -> tuple[np.ndarray, np.ndarray]:
     """One random direction at each state, and the given products of the Hessian with them, (N, n) each."""
-    assert functions.hessian_vector is not None
     v = _directions(_numbers(x), None, 1, own)[:, 0]
     vectors = like(v, x)
     return v, np.stack([_numbers(functions.hessian_vector(x[i], vectors[i])) for i in range(len(x))])

@@ -67,7 +67,7 @@ class Hamiltonian:
     def __init__(self, name: str, definition: Any, inverse_mass: np.ndarray | None, quadratic_kinetic: bool) -> None:
         self.name = name
         self.definition = definition
-        self.symbols: SymbolicHamiltonian | None = definition.symbols
+        self.symbols: Any = definition.symbols
         self.ndof: int = definition.ndof
         self.separable: bool = definition.separable
         self.inverse_mass = inverse_mass
@@ -76,6 +76,7 @@ class Hamiltonian:
         self.quadratic_kinetic = quadratic_kinetic
         self.stiffness_matrix: np.ndarray | None = None
         self.functions_given: bool = definition.given
+        self.numba_functions: Any = definition.numba_functions
         self.autonomous = not definition.timed
         self._tested: dict[tuple[type, Any], np.ndarray] = {}  # how far, by the kind of states
 
@@ -479,7 +480,7 @@ class Hamiltonian:
         return recorded([form.H], (*times, *form.q, *form.p))
 
     @property
-    def written(self) -> SymbolicHamiltonian | None:
+    def written(self) -> Any:
         """The symbolic definition, or that of a few bodies or a traced function, written when asked for; else None."""
         if self.local is not None:
             return self.local.written
@@ -505,11 +506,6 @@ class Hamiltonian:
     def has_hessian_vector(self) -> bool:
         """False if ∇²V·v of arrays is not to be had, as for a gradient that was given without it."""
         return self.definition.has_hessian_vector
-
-    @property
-    def numba_functions(self) -> tuple[Any, Any, Any] | None:
-        """(potential, gradient, hessian_vector) if the system was given by Numba functions, else None."""
-        return self.definition.numba_functions
 
 
 def third_derivative(system: Hamiltonian, q: Array, v: Array, w: Array, t: Any = None) -> Array:

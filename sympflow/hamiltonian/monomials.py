@@ -23,7 +23,6 @@ Monomials = tuple[tuple[int, ...], ...]  # exponents of q1 … qd, one tuple a m
 
 def monomials(symbols: SymbolicHamiltonian, degree: int) -> Monomials:
     """Return the monomials up to a total degree that a kick of a trained flow can use, for H = ½ pᵀM⁻¹p + V(q)."""
-    assert symbols.V is not None
     d = symbols.ndof
     if math.comb(d + degree, d) > 1000 * MOST_MONOMIALS:
         raise ValueError(_too_many(degree, d))
@@ -40,7 +39,6 @@ def _generated(symbols: SymbolicHamiltonian, degree: int) -> set[tuple[int, ...]
     import sympy as sp
 
     M = symbols.inverse_mass
-    assert M is not None
     d = symbols.ndof
     pairs = [(i, j) for i in range(d) for j in range(d) if M[i, j] != 0]
     of_v = {m for m in sp.Poly(symbols.V, *symbols.q).monoms() if any(m)}
@@ -63,7 +61,6 @@ def _as_even(symbols: SymbolicHamiltonian, degree: int) -> list[tuple[int, ...]]
     """The monomials that are as even as V."""
     import sympy as sp
 
-    assert symbols.V is not None
     found = [m for m in itertools.product(range(degree + 1), repeat=symbols.ndof) if 1 <= sum(m) <= degree]
     for signs in _signs(symbols.ndof):
         mirrored = symbols.V.xreplace({s: sign * s for s, sign in zip(symbols.q, signs, strict=True)})

@@ -96,7 +96,7 @@ class SymbolicHamiltonian(Definition):
     _written: tuple[sp.Expr, dict[sp.Symbol, sp.Expr]] | None = None
     """H as it was written, and the values of its parameters; None without any."""
 
-    time: sp.Symbol | None = None
+    time: Any = None
     named_time: sp.Symbol | None = None
     """The time as it was given; `time` is None where H, by the values of its parameters, does not depend on it."""
     samples: Mapping[str, Samples] = MappingProxyType({})
@@ -299,7 +299,6 @@ class SymbolicHamiltonian(Definition):
 
     def has_period(self, period: float) -> bool:
         """Return True if H, up to a function of t alone, has a period in t."""
-        assert self.time is not None
         return has_period(self.H, self.time, (*self.q, *self.p), self.samples, period)
 
     @cached_property
@@ -313,7 +312,7 @@ class SymbolicHamiltonian(Definition):
         return drift(tuple(gradient(self.T, self.p)), self.time)
 
     @cached_property
-    def inverse_mass(self) -> sp.Matrix | None:
+    def inverse_mass(self) -> Any:
         """M⁻¹ if T = ½ pᵀM⁻¹p exactly, else None."""
         if self.T is None or not self.T.is_polynomial(*self.p):
             return None
@@ -331,20 +330,18 @@ class SymbolicHamiltonian(Definition):
     @cached_property
     def force_gradient(self) -> sp.Expr:
         """−½|∇V|²_{M⁻¹}."""
-        assert self.inverse_mass is not None
         slope = sp.Matrix(self.slope)
         return -(slope.T * self.inverse_mass * slope)[0] / 2
 
     @cached_property
     def W(self) -> sp.Expr:
         """½ v·∇²V v with v = M⁻¹∇V."""
-        assert self.inverse_mass is not None
         slope = sp.Matrix(self.slope)
         v = self.inverse_mass * slope
         return (v.T * sp.hessian(self.V, self.q) * v)[0] / 2
 
     @cached_property
-    def poles(self) -> Poles | None:  # type: ignore[override]
+    def poles(self) -> Poles | None:
         return SymbolicPoles(self) or None
 
     # array functions, state y = [q, p] on the last axis -------------------------------------------
@@ -718,7 +715,7 @@ def without_deltas(f: sp.Expr) -> sp.Expr:
     return f.replace(sp.DiracDelta, lambda *arguments: sp.S.Zero) if f.has(sp.DiracDelta) else f
 
 
-def _split(H: sp.Expr, q: tuple[sp.Symbol, ...], p: tuple[sp.Symbol, ...]) -> tuple[sp.Expr | None, sp.Expr | None]:
+def _split(H: sp.Expr, q: tuple[sp.Symbol, ...], p: tuple[sp.Symbol, ...]) -> tuple[Any, Any]:
     """V(q) and T(p) with H = T + V, or (None, None). Constants go to V."""
     qs, ps = set(q), set(p)
     terms = sp.Add.make_args(H)

@@ -599,8 +599,7 @@ class HamiltonianSystem(Hamiltonian, Answering):
 
         if isinstance(domain, LatticeStates):
             return domain
-        states = self.y0 if domain is None else domain.sample(DRAWN)
-        assert states is not None
+        states: Any = self.y0 if domain is None else domain.sample(DRAWN)
         return LatticeStates.of_states(self, states)
 
     @cached_property
@@ -768,14 +767,9 @@ class HamiltonianSystem(Hamiltonian, Answering):
         return self._params
 
     def check_parameters(self, names: Iterable[str]) -> None:
-        """Refuse names other than those of the parameters of H.
+        """Refuse names other than those of the parameters of H, by a ValueError with these.
 
-        Raises
-        ------
-        TypeError
-            If the system is given by functions, or a parameter is an array of a lattice's sites.
-        ValueError
-            With the names that it has.
+        A TypeError if the system is given by functions, or a parameter is an array of a lattice's sites.
         """
         if self.local is not None:
             self.local.check_numbers(names)
@@ -822,7 +816,6 @@ class HamiltonianSystem(Hamiltonian, Answering):
         if self.local is not None:
             return HamiltonianSystem._of_local(self.local.with_params(values), self.damping, self.scene)
         self.check_parameters(values)
-        assert self.symbols is not None
         H, time = self.symbols.written[0], self.symbols.named_time
         params = {**self.params, **values}
         made = HamiltonianSystem.from_sympy(H, params=params, time=time, damping=self.damping, **vars(self.scene))
@@ -919,10 +912,7 @@ class HamiltonianSystem(Hamiltonian, Answering):
     def linear_part(self) -> LinearPart:
         """The quadratic part of H: K, its frequencies, the remaining potential U, and the `stiffness`.
 
-        Raises
-        ------
-        ValueError
-            If there is no such part, or its stiff direction turns.
+        A ValueError if there is no such part, or its stiff direction turns.
         """
         from sympflow.hamiltonian.linear_part import linear_part
 
@@ -962,7 +952,7 @@ class HamiltonianSystem(Hamiltonian, Answering):
         if 0 < len(H) <= TYPESET:
             import sympy
 
-            formula = "H = " + sympy.latex(self.symbols.H)  # type: ignore[union-attr]
+            formula = "H = " + sympy.latex(self.symbols.H)
         facts = {
             "H": "" if formula else H,
             "parameters": parameters_text(self.params, GREEK, " = "),

@@ -17,7 +17,7 @@ from sympflow.hamiltonian.system import HamiltonianSystem, Parameters, Scene
 from sympflow.lazy import lately_kept
 
 if TYPE_CHECKING:
-    from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
+    pass
 
 LARGEST_SHIFT = 1e100
 
@@ -150,7 +150,7 @@ def projected(x: Array) -> Array:
     return concatenate([x[..., :d], x[..., d + 1 : -1]])
 
 
-def _symbols(system: HamiltonianSystem) -> SymbolicHamiltonian | None:
+def _symbols(system: HamiltonianSystem) -> Any:
     """H in symbols, of a lattice or pairs with all terms one by one."""
     return system.written if system.local is None else system.local.spelled
 
@@ -161,7 +161,6 @@ def _expression(system: HamiltonianSystem, c: float) -> Any:
     from sympflow.hamiltonian.symbolic import exact
 
     symbols = _symbols(system)
-    assert symbols is not None
     B = sp.Symbol(f"p{symbols.ndof + 1}", real=True)
     return sp.log(symbols.T + B) - sp.log(exact(c) - symbols.V)
 

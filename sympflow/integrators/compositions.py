@@ -443,7 +443,6 @@ class MollifiedLinearRest(LinearRest):
     label = "mollified"
 
     def filters(self, h: Any) -> Any:
-        assert self.parts.linear is not None
         for part in self.parts.rest:
             if part.turns:
                 raise ValueError(
@@ -462,7 +461,6 @@ class MidpointLinearRest(LinearRest):
 
     def times(self, s: Any) -> Any:
         parts = self.parts
-        assert parts.linear is not None
         times = _each_class(s, parts)
         kinds = [parts.linear.kinds[j] for j in parts.linear.representatives]
         rates = like(parts.linear.rates[parts.linear.representatives], times)
@@ -524,7 +522,7 @@ class SolvableParts(ExactMaps):
 
 
 class TwoCopies(SolvableParts):
-    """Strang steps over H(q, y), H(x, p) and the coupling of two copies of phase space, for any H: see `copies`."""
+    """Strang steps over H(q, y), H(x, p) and the coupling of two copies of phase space, for any H: see `two_copies`."""
 
     label = "copies"
     keeps = "the second copy of phase space"
@@ -534,23 +532,23 @@ class TwoCopies(SolvableParts):
         super().__init__(method, scheme, system)
 
     def _parts(self, system: HamiltonianSystem, parts: Any) -> ExactParts:
-        from sympflow.hamiltonian.copies import two_copies
+        from sympflow.hamiltonian.parts import two_copies
 
         return two_copies(system, self.omega)
 
     def lift(self, y: Array) -> Array:
-        from sympflow.hamiltonian.copies import both
+        from sympflow.hamiltonian.parts import both
 
         return both(y, self.ndof)
 
     def project(self, x: Array) -> Array:
-        from sympflow.hamiltonian.copies import mean
+        from sympflow.hamiltonian.parts import mean
 
         return mean(x, self.ndof)
 
     def distance(self, x: Array) -> Array:
         """The largest difference of the copies, and the size of their states: (..., 4d) to (..., 2)."""
-        from sympflow.hamiltonian.copies import distance
+        from sympflow.hamiltonian.parts import distance
 
         return distance(x, self.scale)
 

@@ -176,12 +176,8 @@ class Watched(ByVectorField):
         if t0 == t_end:
             record.empty(t0, y0)
         states = record.outputs
-        stats: dict[str, Any] = {
-            "n_steps": trace.n_steps,
-            "force_evaluations": trace.evaluations,
-            "hessian_evaluations": 0,
-            "backend": "torchdiffeq",
-        }
+        stats: dict[str, Any] = dict(zip(COUNTS, (trace.n_steps, trace.evaluations, 0), strict=True))
+        stats["backend"] = "torchdiffeq"
         ended = record.end is not None
         trace.failed = bool(failure) and not ended
         if trace.failed:
@@ -195,13 +191,9 @@ class Watched(ByVectorField):
             if problem.t_eval is None and not (times.size and times[-1] == t_end):
                 times, states = np.append(times, t_end), [*states, record.end[1]]
         status: Any = 1 if ended else -int(bool(failure))
-        outcome = Outcome(
-            times,
-            stack(states, axis=0) if states else y0[None][:0],
-            np.full(y0.shape[:-1], status) if y0.ndim > 1 else status,
-            (ENDED if status == 1 else failure or finished(problem)) + trace.note,
-            stats,
-        )
+        message = (ENDED if status == 1 else failure or finished(problem)) + trace.note
+        y = stack(states, axis=0) if states else y0[None][:0]
+        outcome = Outcome(times, y, np.full(y0.shape[:-1], status) if y0.ndim > 1 else status, message, stats)
         if problem.dense_output:
             outcome.sol = Piecewise(kept, y0, t0, t_end)
         return outcome, trace
