@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from sympflow.arguments import check_flag, check_one_of, check_positive, warn
-from sympflow.arrays import Array, to_numpy
+from sympflow.arrays import Array, to_numpy, values
 from sympflow.events import EventSearch
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.time_transformation import checked_shift
@@ -424,7 +424,7 @@ def _extended_run(run: Callable[[Problem], Outcome], extension: Composition, pro
         if apart > APART and np.all(np.asarray(outcome.status) >= 0):
             _warn(extension, apart, "")
     elif len(x):
-        _warn_of_distance(extension, to_numpy(x), outcome)
+        _warn_of_distance(extension, x, outcome)
     if stopped is not None:
         raise stopped
     return outcome
@@ -440,9 +440,12 @@ def _noted(store: RunStore, extension: Composition, x: np.ndarray) -> np.ndarray
     return np.asarray(extension.project(x))
 
 
-def _warn_of_distance(extension: Composition, x: np.ndarray, outcome: Outcome) -> None:
+def _warn_of_distance(extension: Composition, x: Array, outcome: Outcome) -> None:
+    found = values(x)  # under vmap those of all lanes, which come first
+    if found is None:
+        return
     with np.errstate(all="ignore"):
-        ratio = _ratio(np.asarray(extension.distance(x)).max(0))
+        ratio = _ratio(np.asarray(extension.distance(found)).max(found.ndim - x.ndim))
     outcome.stats["copy_distance"] = float(np.nanmax(ratio)) if not np.isnan(ratio).all() else float("nan")
     lost = (ratio > APART) & (np.asarray(outcome.status) >= 0)  # what has failed says more
     if lost.any():

@@ -31,7 +31,7 @@ from sympflow.integrators.contract import (
 )
 from sympflow.integrators.grid import Grid
 from sympflow.integrators.impulses import pieces_of
-from sympflow.integrators.interpolants import Batch, Interpolant, Piecewise, hermite, quartic
+from sympflow.integrators.interpolants import THIRDS, Batch, Interpolant, Piecewise
 from sympflow.integrators.runge_kutta import ExplicitStep, RungeKutta, hopeless, weighted
 from sympflow.integrators.steppers import Stepper, stepper_of
 from sympflow.integrators.tableaux import ADAPTIVE, FIXED, MULTISTEP, Tableau
@@ -283,7 +283,8 @@ class Adaptive(Watched, RungeKutta):
     The trajectories of a batch share their steps; if that fails, it is run in parts, so that those of its trajectories
     that can reach their end do. Without `t_eval` the
     states are reported every `system.dt`. Between the steps, for outputs, events and the dense output alike, the state
-    is torchdiffeq's interpolation: the quartic through both ends, their slopes and the state at the middle of the step.
+    is a polynomial through both ends with their slopes: of "dopri5" torchdiffeq's quartic, through the middle as well,
+    and of "dopri8" that of degree 7, through steps to the thirds, of which torchdiffeq's quartic is far less exact.
 
     Parameters
     ----------
@@ -329,7 +330,7 @@ class Adaptive(Watched, RungeKutta):
         return int(self.max_num_steps)
 
     def make_trace(self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array, visit: Visit) -> Trace:
-        return _Stages(self.tableau, system, t_span, y0, visit)
+        return _Stages(self, system, t_span, y0, visit)
 
     def integrate(self, trace: Trace, y: Any, length: float) -> None:
         import torch
@@ -373,9 +374,9 @@ class Adaptive(Watched, RungeKutta):
 class _Stages(Trace):
     """Collects the slopes of each step: torchdiffeq interpolates from them."""
 
-    def __init__(self, tableau: Tableau, *arguments: Any) -> None:
+    def __init__(self, method: Adaptive, *arguments: Any) -> None:
         super().__init__(*arguments)
-        self.tableau = tableau
+        self.method, self.tableau = method, method.tableau
         self.first: Any = None
         self.slopes: list[Any] = []
 
@@ -393,10 +394,20 @@ class _Stages(Trace):
         if not differentiable(s, dt):
             s, dt = float(s), float(dt)
         t0, t1 = (self.t_span[0] + self.direction * x for x in (s, s + dt))
-        h = self.direction * dt
-        y1, middle = (y + h * weighted(weights, K) for weights in (self.tableau.B, self.tableau.middle))
         self.first = self.slopes[-1]
-        self.announce(quartic(t0, t1, y, y1, middle, K[0], K[-1]))
+        self.announce(Interpolant(t0, t1, y, lambda: self._inside(t0, t1, y, K)))
+
+    def _inside(self, t0: Any, t1: Any, y: Array, K: list[Array]) -> tuple[list[Array], list[Array]]:
+        """The states and slopes of a step that it is interpolated from."""
+        h, tableau = t1 - t0, self.tableau
+        states, slopes = [y, y + h * weighted(tableau.B, K)], [K[0], K[-1]]
+        if tableau.middle:
+            states.append(y + h * weighted(tableau.middle, K))
+        elif tableau.order > 3:  # of a cubic
+            states += [self.method.step(self.system, t0, y, x * h) for x in THIRDS]
+            slopes += [self.system.vector_field(z, t0 + x * h) for x, z in zip(THIRDS, states[2:], strict=True)]
+            self.evaluations += len(THIRDS) * (len(tableau.B) + 1)
+        return states, slopes
 
 
 @dataclass(frozen=True)
@@ -485,7 +496,8 @@ class _Nodes(Trace):
         before, self.before = self.before, (y, f)
         if before is not None:
             k = self.n_steps
-            self.announce(hermite(self.times[k], self.times[k + 1], before[0], y, before[1], f))
+            values = (before[0], y), (before[1], f)
+            self.announce(Interpolant(self.times[k], self.times[k + 1], before[0], lambda: values))
 
 
 @cache
