@@ -289,9 +289,9 @@ def _drift_first(drifts: tuple[float, ...], kicks: tuple[float, ...]) -> tuple[t
     return (0.0, *kicks), drifts
 
 
-def _palindrome(half: tuple[float, ...], total: float = 1.0) -> tuple[float, ...]:
-    """Coefficients w₁ … w_m, w₀, w_m … w₁ with the middle one making the sum `total`."""
-    return (*half, total - 2.0 * sum(half), *reversed(half))
+def _palindrome(half: tuple[float, ...]) -> tuple[float, ...]:
+    """Coefficients w₁ … w_m, w₀, w_m … w₁ with the middle one making the sum 1."""
+    return (*half, 1.0 - 2.0 * sum(half), *reversed(half))
 
 
 def _even_palindrome(half: tuple[float, ...]) -> tuple[float, ...]:
@@ -439,12 +439,7 @@ _registered: dict[str, Scheme] = {}
 def scheme_named(name: str) -> Scheme:
     """Return the scheme of that name: of `SCHEMES`, one that was registered, or that of an installed plug-in.
 
-    Raises
-    ------
-    ValueError
-        If there is none.
-    ImportError
-        If the plug-in that announces it cannot be loaded, or announces something else.
+    A ValueError if there is none; an ImportError if the plug-in cannot be loaded, or announces something else.
     """
     if name in SCHEMES:
         return SCHEMES[name]
@@ -477,12 +472,8 @@ def announced_schemes() -> dict[str, EntryPoint]:
 def checked_scheme(scheme: Any) -> Scheme:
     """Return the scheme, if it is one of finite numbers that is consistent where it declares an order.
 
-    Raises
-    ------
-    TypeError
-        If it is no Scheme, or not of numbers.
-    ValueError
-        If a number is not finite, the order is no positive integer, or kicks or drifts do not add up to 1.
+    A TypeError if it is no Scheme, or not of numbers; a ValueError if a number is not finite, the order is no positive
+    integer, or kicks or drifts do not add up to 1.
     """
     if not isinstance(scheme, Scheme):
         raise TypeError(

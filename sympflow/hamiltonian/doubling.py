@@ -37,6 +37,7 @@ _DRAWN = 1000  # states that find the extent of a domain
 
 class DoubledSystem(HamiltonianSystem):
     """A Hamiltonian system in twice the variables whose physical limit has friction and any other force: see `doubled`.
+
     `physical` is the system of the limit, with F as its `external_force`, which Runge–Kutta methods integrate as it is.
     """
 

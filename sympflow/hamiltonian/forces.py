@@ -22,7 +22,6 @@ class SymbolicForce:
 
     def __init__(self, system: HamiltonianSystem, force: Any, params: Mapping[str, float] | None) -> None:
         symbols = system.symbols
-        assert symbols is not None
         self.q, self.p, self.time = symbols.q, symbols.p, symbols.time
         self.form = symbols.like(symbols.H)  # with functions of its own
         d = system.ndof
@@ -85,7 +84,6 @@ class SymbolicForce:
 def doubled_hamiltonian(system: HamiltonianSystem, force: SymbolicForce) -> sp.Expr:
     """p₋·∂H/∂p + q₋·(∂H/∂q + Γp − F) in q1 … q2d, p1 … p2d, which are q₊, q₋ and p₋, p₊."""
     symbols = system.symbols
-    assert symbols is not None
     d = system.ndof
     q, p = (sp.symbols(f"{letter}1:{2 * d + 1}", real=True) for letter in "qp")
     G = system.friction.matrix(d)

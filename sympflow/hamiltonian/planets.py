@@ -68,12 +68,7 @@ class Frame:
     """
 
     def __init__(
-        self,
-        local: PairsHamiltonian,
-        G: float,
-        y0: np.ndarray,
-        coordinates: str = "jacobi",
-        encounter: float | None = 1.0,
+        self, local: Any, G: float, y0: np.ndarray, coordinates: str = "jacobi", encounter: float | None = 1.0
     ) -> None:
         self.local, self.G, self.coordinates, self.encounter = local, G, coordinates, encounter
         masses = self.masses = local.masses
@@ -328,23 +323,13 @@ def newtonian(local: PairsHamiltonian) -> float | None:
 
 
 class PlanetsHamiltonian(PairsHamiltonian):
-    """H = Σ |p_i|²/2m_i − G Σ_{i<j} m_i m_j/r_ij, with a star, body 0: see `HamiltonianSystem.planets`.
-
-    Bodies of mass 0 have momenta per unit mass; they feel the others and are not felt.
-    """
+    """H = Σ |p_i|²/2m_i − G Σ_{i<j} m_i m_j/r_ij, with a star, body 0: see `HamiltonianSystem.planets`."""
 
     noun = "system of planets"
     extra: sp.Expr | None = None
 
     def __init__(
-        self,
-        masses: Any,
-        G: float,
-        y0: np.ndarray,
-        coordinates: Any,
-        encounter: Any,
-        extra: Any = None,
-        params: Any = None,
+        self, masses: Any, G: float, y0: Any, coordinates: Any, encounter: Any, extra: Any = None, params: Any = None
     ) -> None:
         if coordinates not in COORDINATES:
             raise ValueError(f"`coordinates` must be 'jacobi' or 'democratic'; got {coordinates!r}.")
@@ -392,10 +377,7 @@ class PlanetsHamiltonian(PairsHamiltonian):
         return [given[name] for name in self._letters]
 
     def extra_program(self, order: int) -> Program:
-        """The extra potential of a body at x, y, z from the star, with order 0; its slope, and along vectors that.
-
-        The numbers are x, y, z, those of `extra_values`, and the vectors.
-        """
+        """The extra potential of a body at x, y, z from the star, with order 0; its slope, and along vectors that."""
         if order not in self._programs:
             names = [*PLACE[:3], *self._letters, *(f"{name}{k}" for k in range(1, order) for name in PLACE[:3])]
 
@@ -469,12 +451,7 @@ class PlanetsHamiltonian(PairsHamiltonian):
         return self.felt is None and self.extra is None and super().is_few
 
     def written_potential(
-        self,
-        q: Sequence[sp.Expr],
-        softening: sp.Expr,
-        columns: Sequence[Sequence[sp.Expr]],
-        c: Mapping[sp.Symbol, sp.Expr],
-        box: Sequence[sp.Expr] = (),
+        self, q: Sequence[Any], softening: Any, columns: Sequence[Any], c: Mapping[Any, Any], box: Sequence[Any] = ()
     ) -> sp.Expr:
         V = super().written_potential(q, softening, columns, c, box)
         if self.extra is None:

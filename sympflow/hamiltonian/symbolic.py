@@ -96,7 +96,7 @@ class SymbolicHamiltonian(Definition):
     _written: tuple[sp.Expr, dict[sp.Symbol, sp.Expr]] | None = None
     """H as it was written, and the values of its parameters; None without any."""
 
-    time: sp.Symbol | None = None
+    time: Any = None
     named_time: sp.Symbol | None = None
     """The time as it was given; `time` is None where H, by the values of its parameters, does not depend on it."""
     samples: Mapping[str, Samples] = MappingProxyType({})
@@ -105,10 +105,7 @@ class SymbolicHamiltonian(Definition):
     _rest: SymbolicHamiltonian | None = None  # H without its impulses, where it has some
 
     def __init__(
-        self,
-        expression: str | sp.Expr,
-        params: Mapping[str, Any] | None = None,
-        time: str | sp.Symbol | None = None,
+        self, expression: str | sp.Expr, params: Mapping[str, Any] | None = None, time: str | sp.Symbol | None = None
     ) -> None:
         params = checked_params(params)
         self.time = self.named_time = named_time(time, params)
@@ -302,7 +299,6 @@ class SymbolicHamiltonian(Definition):
 
     def has_period(self, period: float) -> bool:
         """Return True if H, up to a function of t alone, has a period in t."""
-        assert self.time is not None
         return has_period(self.H, self.time, (*self.q, *self.p), self.samples, period)
 
     @cached_property
@@ -316,7 +312,7 @@ class SymbolicHamiltonian(Definition):
         return drift(tuple(gradient(self.T, self.p)), self.time)
 
     @cached_property
-    def inverse_mass(self) -> sp.Matrix | None:
+    def inverse_mass(self) -> Any:
         """M⁻¹ if T = ½ pᵀM⁻¹p exactly, else None."""
         if self.T is None or not self.T.is_polynomial(*self.p):
             return None
@@ -334,20 +330,18 @@ class SymbolicHamiltonian(Definition):
     @cached_property
     def force_gradient(self) -> sp.Expr:
         """−½|∇V|²_{M⁻¹}."""
-        assert self.inverse_mass is not None
         slope = sp.Matrix(self.slope)
         return -(slope.T * self.inverse_mass * slope)[0] / 2
 
     @cached_property
     def W(self) -> sp.Expr:
         """½ v·∇²V v with v = M⁻¹∇V."""
-        assert self.inverse_mass is not None
         slope = sp.Matrix(self.slope)
         v = self.inverse_mass * slope
         return (v.T * sp.hessian(self.V, self.q) * v)[0] / 2
 
     @cached_property
-    def poles(self) -> Poles | None:  # type: ignore[override]
+    def poles(self) -> Poles | None:
         return SymbolicPoles(self) or None
 
     # array functions, state y = [q, p] on the last axis -------------------------------------------
@@ -417,18 +411,15 @@ class SymbolicHamiltonian(Definition):
         return self._function(name + "'" * order, expressions, (_single, assemble, _square)[order])
 
     def _function(
-        self,
-        key: str,
-        expressions: Callable[[], list[sp.Expr]],
-        collect: Callable[[Sequence[Array], Array], Array],
+        self, key: str, expressions: Callable[[], list[sp.Expr]], collect: Callable[[Sequence[Array], Array], Array]
     ) -> Callable[..., Array]:
         """A function of an array (..., n), and of the time, generated for NumPy or torch when first called with one."""
         if key in self._functions:
             return self._functions[key]
         name = key.rstrip("'")
         variables = self._variables(name)
-        n = len(variables)
-        moving = self._moving(name)
+        n, timed = len(variables), self.kinetic_timed if name in ("T", "drift") else self.timed
+        moving = (self.time,) * timed + (DURATION,) * (name == "drift")
         generated: dict[str, Callable[..., list[Any]]] = {}
         values_of_samples: list[tuple[sampled, Callable[..., Any]]] = []
 
@@ -455,11 +446,6 @@ class SymbolicHamiltonian(Definition):
 
         self._functions[key] = function
         return function
-
-    def _moving(self, name: str) -> tuple[sp.Symbol, ...]:
-        """The times that a function takes after the states."""
-        timed = self.kinetic_timed if name in ("T", "drift") else self.timed
-        return (self.time,) * timed + (DURATION,) * (name == "drift")
 
     _generated = ("_functions", "_switches", "poles")
 
@@ -729,7 +715,7 @@ def without_deltas(f: sp.Expr) -> sp.Expr:
     return f.replace(sp.DiracDelta, lambda *arguments: sp.S.Zero) if f.has(sp.DiracDelta) else f
 
 
-def _split(H: sp.Expr, q: tuple[sp.Symbol, ...], p: tuple[sp.Symbol, ...]) -> tuple[sp.Expr | None, sp.Expr | None]:
+def _split(H: sp.Expr, q: tuple[sp.Symbol, ...], p: tuple[sp.Symbol, ...]) -> tuple[Any, Any]:
     """V(q) and T(p) with H = T + V, or (None, None). Constants go to V."""
     qs, ps = set(q), set(p)
     terms = sp.Add.make_args(H)
@@ -770,9 +756,12 @@ def generate(expressions: Sequence[sp.Expr], variables: Sequence[sp.Symbol], lib
     code = []
     for f in expressions:
         large = [n for n in f.atoms(sp.Integer) if abs(n) >= 2**63]  # which no 64 bits hold
-        written = _by_reciprocals(f.xreplace({n: sp.Float(int(n)) for n in large}))
+        written = f.xreplace({n: sp.Float(int(n)) for n in large})
+        for of, reciprocal in _RECIPROCALS.items():
+            written = written.replace(of, reciprocal) if written.has(of) else written
         code.append(_by_products(written) if library == "numpy" else written.replace(sp.erfc, tensor_erfc))
-    sums = [_in_pieces(f) for f in code]
+    n = LONGEST_SUM  # Python's compiler nests sums as deep as they have terms
+    sums = [[sp.Add(*f.args[i : i + n]) for i in range(0, len(f.args), n)] if f.is_Add else [f] for f in code]
     pieces = [piece for f in sums for piece in f]
     try:
         function = sp.lambdify(variables, pieces, modules=_modules(library, code), cse=True)
@@ -788,13 +777,6 @@ def generate(expressions: Sequence[sp.Expr], variables: Sequence[sp.Symbol], lib
         return [reduce(add, islice(values, len(f))) for f in sums]
 
     return summed
-
-
-def _in_pieces(f: sp.Expr) -> list[sp.Expr]:
-    """A sum as sums of up to `LONGEST_SUM` terms: Python's compiler nests them as deep as they have terms."""
-    if not f.is_Add or len(f.args) <= LONGEST_SUM:
-        return [f]
-    return [sp.Add(*f.args[i : i + LONGEST_SUM]) for i in range(0, len(f.args), LONGEST_SUM)]
 
 
 def _by_products(f: sp.Expr) -> sp.Expr:
@@ -827,13 +809,6 @@ _RECIPROCALS: dict[Any, Callable[[Any], Any]] = {
     sp.acot: lambda x: sp.atan(1 / x, evaluate=False),
 }
 """Functions that torch has not, and that SymPy writes for NumPy by exponentials, which cancel near 0 and overflow."""
-
-
-def _by_reciprocals(f: sp.Expr) -> sp.Expr:
-    for function, written in _RECIPROCALS.items():
-        if f.has(function):
-            f = f.replace(function, written)
-    return f
 
 
 def _integer_power(x: np.ndarray, n: int) -> np.ndarray:

@@ -13,12 +13,11 @@ from sympflow.arrays import Array, concatenate, library
 from sympflow.arrays import like as as_like
 from sympflow.hamiltonian.definition import Definition
 from sympflow.hamiltonian.domain import Domain
-from sympflow.hamiltonian.scene import Scene
-from sympflow.hamiltonian.system import HamiltonianSystem, Parameters
+from sympflow.hamiltonian.system import HamiltonianSystem, Parameters, Scene
 from sympflow.lazy import lately_kept
 
 if TYPE_CHECKING:
-    from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
+    pass
 
 LARGEST_SHIFT = 1e100
 
@@ -111,7 +110,7 @@ def default_shift(system: HamiltonianSystem) -> float:
 @lately_kept
 def _energy(system: HamiltonianSystem, y0: bytes) -> float:
     """H at the system's y0, kept: every run asks for it several times."""
-    return float(system.hamiltonian(np.frombuffer(y0)))
+    return float(system.hamiltonian(np.frombuffer(y0).copy()))
 
 
 def checked_shift(shift: Any) -> float:
@@ -151,7 +150,7 @@ def projected(x: Array) -> Array:
     return concatenate([x[..., :d], x[..., d + 1 : -1]])
 
 
-def _symbols(system: HamiltonianSystem) -> SymbolicHamiltonian | None:
+def _symbols(system: HamiltonianSystem) -> Any:
     """H in symbols, of a lattice or pairs with all terms one by one."""
     return system.written if system.local is None else system.local.spelled
 
@@ -162,7 +161,6 @@ def _expression(system: HamiltonianSystem, c: float) -> Any:
     from sympflow.hamiltonian.symbolic import exact
 
     symbols = _symbols(system)
-    assert symbols is not None
     B = sp.Symbol(f"p{symbols.ndof + 1}", real=True)
     return sp.log(symbols.T + B) - sp.log(exact(c) - symbols.V)
 

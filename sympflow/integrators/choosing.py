@@ -113,10 +113,7 @@ def _flow_holds(system: HamiltonianSystem, y0: Array, tol: float | None) -> bool
 
 @lately_kept
 def _attractive_pole(system: HamiltonianSystem, states: bytes) -> tuple[str, bool]:
-    """A place towards which V falls without bound from all positions, in words; True if like a power where V < 0.
-
-    Such places are q = 0 and those where an expression of H vanishes that is next to them.
-    """
+    """A place towards which V falls without bound from all positions, in words; True if like a power where V < 0."""
     if not system.definition.poles or (system.local is not None and system.written is None):
         return "", False
     q = np.frombuffer(states).reshape(-1, 2 * system.ndof)[:, : system.ndof]
@@ -134,7 +131,6 @@ def _centers(system: HamiltonianSystem, q: np.ndarray) -> Iterator[tuple[str, np
     """Names and positions (n, d) of the zeros that are next to positions q of what vanishes where H is infinite."""
     yield "q = 0" if system.local is None else "r = 0", np.zeros_like(q)
     poles, d = system.definition.poles, system.ndof
-    assert poles is not None
 
     def sizes(x: np.ndarray) -> np.ndarray:
         return poles.sizes(np.concatenate([x, 0 * x], axis=-1), np.zeros(x.shape[:-1]))

@@ -54,10 +54,7 @@ ARRAYS_ONLY = (
 
 
 class LogarithmicClock(NamedTuple):
-    """A method with equal steps in s, on one system.
-
-    The method has an `inner` one, which is applied to the transformed system, with `evaluations` on that.
-    """
+    """A method with equal steps in s, on one system."""
 
     method: Any
     system: HamiltonianSystem
@@ -333,10 +330,7 @@ class PhysicalRun(Run):
         return (found[None] if alone else np.moveaxis(found, 0, 1)), good
 
     def _within(self, start: np.ndarray, target: Any) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
-        """The states before and after the elapsed times `target`, of steps from `start` (M, 2d + 2), and their number.
-
-        That many whole steps are before the first one.
-        """
+        """The states before and after the elapsed times `target`, of steps from `start` (M, 2d + 2), and how many."""
         save = np.arange(self.stride + 1)
         states = np.moveaxis(self.stepper.rollout(start, self.h, self.stride, save)[0], 0, 1)
         self.n_extra += len(start) * self.stride

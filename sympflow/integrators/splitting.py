@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from sympflow.arguments import check_flag, check_one_of, check_positive, warn
-from sympflow.arrays import Array, to_numpy
+from sympflow.arrays import Array, to_numpy, values
 from sympflow.events import EventSearch
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.time_transformation import checked_shift
@@ -45,10 +45,7 @@ END = 1e-9
 
 @dataclass(frozen=True)
 class Clock:
-    """A time in which steps are equal, with the traits of the contract that depend on it.
-
-    `on` makes of a method and a system the method on the clock; None for the physical time, which needs none.
-    """
+    """A time in which steps are equal, with the traits of the contract that depend on it."""
 
     on: Callable[[Splitting, HamiltonianSystem], LogarithmicClock] | None = None
     finds_events: bool = True
@@ -398,7 +395,8 @@ def _extended_run(run: Callable[[Problem], Outcome], extension: Composition, pro
     search = problem.events
     lifted, before = None, []
     if search is not None:  # which may go on from an earlier piece of the run
-        lifted, before = EventSearch(_of_projections(search, extension), search.max_interval), search.found
+        projected = (replace(e, g=lambda t, x, g=e.g: g(t, extension.project(x))) for e in search.events)  # type: ignore
+        lifted, before = EventSearch(tuple(projected), search.max_interval), search.found
         lifted.found, lifted.values, lifted.n_dense = [[*zeros] for zeros in before], search.values, search.n_dense
     store = problem.store
     if store is not None:
@@ -426,17 +424,10 @@ def _extended_run(run: Callable[[Problem], Outcome], extension: Composition, pro
         if apart > APART and np.all(np.asarray(outcome.status) >= 0):
             _warn(extension, apart, "")
     elif len(x):
-        _warn_of_distance(extension, to_numpy(x), outcome)
+        _warn_of_distance(extension, x, outcome)
     if stopped is not None:
         raise stopped
     return outcome
-
-
-def _of_projections(search: EventSearch, extension: Composition) -> Any:
-    return tuple(
-        replace(event, g=lambda t, x, g=event.g: g(t, extension.project(x)))  # type: ignore[misc]
-        for event in search.events
-    )
 
 
 def _noted(store: RunStore, extension: Composition, x: np.ndarray) -> np.ndarray:
@@ -449,9 +440,12 @@ def _noted(store: RunStore, extension: Composition, x: np.ndarray) -> np.ndarray
     return np.asarray(extension.project(x))
 
 
-def _warn_of_distance(extension: Composition, x: np.ndarray, outcome: Outcome) -> None:
+def _warn_of_distance(extension: Composition, x: Array, outcome: Outcome) -> None:
+    found = values(x)  # under vmap those of all lanes, which come first
+    if found is None:
+        return
     with np.errstate(all="ignore"):
-        ratio = _ratio(np.asarray(extension.distance(x)).max(0))
+        ratio = _ratio(np.asarray(extension.distance(found)).max(found.ndim - x.ndim))
     outcome.stats["copy_distance"] = float(np.nanmax(ratio)) if not np.isnan(ratio).all() else float("nan")
     lost = (ratio > APART) & (np.asarray(outcome.status) >= 0)  # what has failed says more
     if lost.any():

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
-from sympflow.compiler.control import BOOL, INT, POINTER, Code, Module, Type, Value, Variable
+from sympflow.compiler.control import BOOL, INT, POINTER, Code, Module, Rows, Type, Value, Variable
 from sympflow.compiler.machine import compiled, host
 
 __all__ = [
@@ -94,12 +94,9 @@ def run_function(
         code.arguments[:15]
     )
     one, zero = code.constant(1, INT), code.constant(0, INT)
-    state: Any
-    if width > 1 and memory is None and over is not None:
-        state = _Chunks(code, n_values, n_out, width, own, over)
-    else:
-        state = _state(code, n_values, n_out, width, memory, code.arguments[15 + kept :], before=width == 1)
-    chunks = state.chunks if isinstance(state, _Chunks) else 1
+    sizes, more = (code, n_values, n_out, width, own, over if width > 1 else None), code.arguments[15 + kept :]
+    state = memory(code, width, more, width == 1) if memory else _Registers(*sizes)
+    chunks = state.chunks
     with code.over(groups(code, n_rows, width * chunks)) as group:
         begin = group * (width * chunks)
         length = (link + 2) * (size * width)
@@ -108,7 +105,6 @@ def run_function(
         state.open(rows, begin, n_rows)
         n, saved, longest = code.variable(first), code.variable(zero), code.variable(state.block(every))
         j, step = code.variable(code.select(zero < first, link, zero)), code.variable(first)
-        alive = code.variable(code.constant(1, Type("i1", 1 if isinstance(state, _Chunks) else width)))
         going = code.variable(first < n_steps)
         history = _History(code, code.arguments[15], group, (n_steps - first) * link, n_values, width) if kept else None
         with code.during(lambda: going.value):
@@ -134,8 +130,7 @@ def run_function(
             if closing:
                 with code.over(closes):
                     state.change(column, link + 1, step.value, end=True)
-            alive.value = alive.value & state.finite()
-            good = code.any(alive.value)
+            good = state.finite()
             going.value = good & code.apply("eq", (code.load(stop, 0, INT, shared=True), zero))
             with code.given(good):
                 n.value = n.value + k
@@ -151,13 +146,11 @@ def run_function(
                 with code.given(~good & (one < k)):
                     state.restore()
                     j.value, step.value, longest.value = j_before, step_before, one
-                    alive.value, going.value = code.constant(1, Type("i1")), code.constant(1, Type("i1"))
+                    going.value = code.constant(1, BOOL)
         if width == 1:
             code.store(n.value, finite, begin)
-        elif isinstance(state, _Chunks):
-            state.mark(n.value, finite, begin, n_rows)
         else:
-            _mark(code, alive.value, n.value, finite, begin, n_rows)
+            state.mark(n.value, finite, begin, n_rows)
         with code.given(one <= keeps):
             state.keep(running, begin, n_rows)
     return finished(code)
@@ -267,7 +260,7 @@ def map_function(
     types = [POINTER, POINTER, INT, POINTER, INT, POINTER, INT, POINTER, *(MEMORY if memory else [])]
     code = begun("map", types)
     table, kinds, n_columns, steps, n_steps, rows, n_rows, out = code.arguments[:8]
-    state = _state(code, n_values, n_out, width, memory, code.arguments[8:])
+    state = memory(code, width, code.arguments[8:], False) if memory else _Registers(code, n_values, n_out, width)
     column = ColumnStage(code, table, kinds, size, 1, width, stage)
     with code.over(groups(code, n_rows, width)) as group:
         begin = group * width
@@ -308,7 +301,7 @@ def step_function(
     types = [POINTER, INT, INT, POINTER, POINTER, POINTER, POINTER, INT, POINTER, *(MEMORY if memory else [])]
     code = begun("steps", types)
     table, n_columns, n_powers, x, h, t, rows, n_rows, out = code.arguments[:9]
-    state = _state(code, n_values, n_out, width, memory, code.arguments[9:])
+    state = memory(code, width, code.arguments[9:], False) if memory else _Registers(code, n_values, n_out, width)
     alone, behind = Lanes(code, 1, width), Lanes(code, own, width) if own else None
     with code.over(groups(code, n_rows, width)) as group:
         begin = group * width
@@ -366,70 +359,6 @@ class Room:
         return self.code.at(self.state if place is None else place, i * self.width)
 
 
-class _Registers:
-    """The state of a run as values, which the machine keeps in registers, and its end, a copy that is closed."""
-
-    def __init__(self, code: Code, n_values: int, n_out: int, width: int) -> None:
-        self.code, self.n_values, self.n_out = code, n_values, code.constant(n_out, INT)
-        self._count, self._lanes = n_out, Lanes(code, n_values, width)
-        self._state: list[Variable] = []
-        self._end: list[Variable] = []
-        self._before: list[Value] = []
-
-    def block(self, every: int) -> Value:
-        """Steps between two looks."""
-        return self.code.constant(every, INT)
-
-    def open(self, rows: Value, begin: Value, n_rows: Value, given: int | None = None, own: int = 0) -> None:
-        """Read a state; numbers behind those that are given are 0."""
-        given = self.n_values if given is None else given
-        lanes = self._lanes if given + own == self.n_values else Lanes(self.code, given + own, self._lanes.width)
-        x = lanes.loaded(rows, begin, n_rows)[:given]
-        zero = self.code.constant(0.0, x[0].type)
-        self._state = [self.code.variable(value) for value in [*x, *[zero] * (self.n_values - len(x))]]
-
-    def change(self, column: Callable[..., Any], j: Value, step: Value, end: bool = False) -> None:
-        state = self._end if end else self._state
-        assign(state, column(j, [x.value for x in state], step))
-
-    def values(self) -> list[Value]:
-        return [x.value for x in self._state]
-
-    def record(self, history: _History, s: Value) -> None:
-        """Keep the state before stage s."""
-        start = history.place(s)
-        for i, x in enumerate(self._state):
-            self.code.store(x.value, start, i * self._lanes.width)
-
-    def look(self, look: Callable[[Any], Any]) -> None:
-        assign(self._state, look(self.values()))
-
-    def remember(self) -> None:
-        self._before = [x.value for x in self._state]
-
-    def restore(self) -> None:
-        assign(self._state, self._before)
-
-    def end(self) -> None:
-        self._end = [self.code.variable(x.value) for x in self._state]
-
-    def finite(self) -> Value:
-        """True where all values of the end are finite: times 0 they are 0."""
-        first, *rest = [x.value for x in self._end]
-        total = first * 0.0
-        for value in rest:
-            total = self.code.fma(value, self.code.constant(0.0, value.type), total)
-        return self.code.apply("eq", (total, 0.0))
-
-    def store(self, out: Value, begin: Value, n_rows: Value, stride: Value, at: Value) -> None:
-        """Write the end to the row `at` of `stride` rows that each trajectory has in `out`."""
-        self._lanes.store([x.value for x in self._end[: self._count]], out, begin, n_rows, stride, at)
-
-    def keep(self, running: Value, begin: Value, n_rows: Value) -> None:
-        one, zero = self.code.constant(1, INT), self.code.constant(0, INT)
-        self._lanes.store([x.value for x in self._state], running, begin, n_rows, one, zero)
-
-
 class _History:
     """The states before the stages of a run, of a group of trajectories."""
 
@@ -446,31 +375,33 @@ class _History:
 
 
 class Memory:
-    """The same in memory: the state, its end, and the state before a block of steps; at most `count` trajectories."""
+    """The state, its end, and the state before a block of steps, in memory."""
 
-    at_once = 1
+    at_once = chunks = 1
+    n_values: Any
+    n_out: Any
+    _running: Any
+    _end: Any
+    _before: Any
 
     def __init__(self, code: Code, width: int, arguments: Sequence[Value], before: bool) -> None:
         self.code, self.width, self._remembers = code, width, before
         self.n_values, self.n_out, work, data = arguments
-        self.count = code.constant(width, INT)
+        self._alive = code.variable(code.constant(1, Type("i1", width)))
         places = [code.at(work, self.n_values * (i * width)) for i in range(4)]
         self.rooms = [Room(code, width, x, places[3], self.n_values, data) for x in places[:3]]
         self._running, self._end, self._before = self.rooms
-
-    def place(self, room: Room, k: Value) -> Value:
-        """The address of the first number of trajectory k."""
-        return self.code.at(room.state, k)
 
     def block(self, every: int) -> Value:
         return self.code.constant(every, INT)
 
     def open(self, rows: Value, begin: Value, n_rows: Value, given: int | None = None, own: int = 0) -> None:
         n = self.n_values if given is None else self.n_out
-        with self.code.over(self.count) as k:
+        self._revive()
+        with self.code.over(self.width) as k:
             start = self.code.at(rows, self.code.apply("min", (begin + k, n_rows - 1)) * (n + own))
             with self.code.over(n) as i:
-                self.code.store(self.code.load(start, i), self.place(self._running, k), i * self.width)
+                self.code.store(self.code.load(start, i), self._running.state, i * self.width + k)
         if given is not None:
             with self.code.over(self.n_values - n) as i:
                 self._running.store(0.0, n + i)
@@ -492,6 +423,10 @@ class Memory:
 
     def restore(self) -> None:
         self._copy(self._before, self._running)
+        self._revive()
+
+    def _revive(self) -> None:
+        self._alive.value = self.code.constant(1, Type("i1", self.width))
 
     def end(self) -> None:
         self._copy(self._running, self._end)
@@ -503,7 +438,7 @@ class Memory:
         with self.code.over(self.code.op("udiv", INT, self.n_values, self.code.constant(self.at_once, INT))) as i:
             yield i * size, Type("double", size)
 
-    def _copy(self, source: Room, target: Room) -> None:
+    def _copy(self, source: Any, target: Any) -> None:
         with self._blocks() as (i, type):
             self.code.store(self.code.load(source.state, i, type), target.state, i)
 
@@ -513,7 +448,8 @@ class Memory:
         with self._blocks() as (i, type):
             total.value = self.code.fma(self.code.load(self._end.state, i, type), zero, total.value)
         good = self.code.apply("eq", (total.value, 0.0))
-        return good if self.at_once == 1 else ~self.code.any(~good)
+        self._alive.value = self._alive.value & (good if self.at_once == 1 else ~self.code.any(~good))
+        return self.code.any(self._alive.value)
 
     def store(self, out: Value, begin: Value, n_rows: Value, stride: Value, at: Value) -> None:
         self._write(self._end, self.n_out, out, begin, n_rows, stride, at)
@@ -522,97 +458,111 @@ class Memory:
         one, zero = self.code.constant(1, INT), self.code.constant(0, INT)
         self._write(self._running, self.n_values, running, begin, n_rows, one, zero)
 
-    def _write(self, room: Room, n: Value, out: Value, begin: Value, n_rows: Value, stride: Value, at: Value) -> None:
-        with self.code.over(self.code.apply("min", (self.count, n_rows - begin))) as k:
-            source, start = self.place(room, k), self.code.at(out, ((begin + k) * stride + at) * n)
+    def _write(self, room: Any, n: Any, out: Value, begin: Value, n_rows: Value, stride: Value, at: Value) -> None:
+        with self.code.over(there(self.code, self.width, begin, n_rows)) as k:
+            source, start = self.code.at(room.state, k), self.code.at(out, ((begin + k) * stride + at) * n)
             with self.code.over(n) as i:
                 self.code.store(self.code.load(source, i * self.width), start, i)
 
+    def mark(self, n: Value, finite: Value, begin: Value, n_rows: Value) -> None:
+        _mark(self.code, self._alive.value, n, finite, begin, n_rows)
 
-class _Chunks(Memory):
-    """Many trajectories in memory, in chunks that pass through registers without waiting for the one before."""
 
-    def __init__(self, code: Code, n_values: int, n_out: int, width: int, own: bool, over: Over) -> None:
-        self.code, self.width, self.type, self._n, self._over = code, width, Type("double", width), n_values, over
-        self._own, self.n_values, self.n_out = own, code.constant(n_values, INT), code.constant(n_out, INT)
-        self.chunks = min(max(FAST_MEMORY // (16 * n_values * width), 1), MOST_CHUNKS)
-        self._running, self._end = (
-            Room(code, width, place, place, self.n_values, place)
-            for place in (code.memory(n_values * self.chunks, self.type) for _ in range(2))
-        )
-        self._watch = code.memory(self.chunks, self.type)
+class _Registers(Memory):
+    """States that pass through registers in each stage: a chunk of lanes, which stays there, or many in memory.
 
-    def open(self, rows: Value, begin: Value, n_rows: Value, given: int | None = None, own: int = 0) -> None:
-        code, chunks = self.code, self.code.constant(self.chunks, INT)
-        self._used = code.apply("min", (groups(code, n_rows - begin, self.width), chunks))
-        self.count = self._used * self.width
-        with code.over(self._used) as c:
-            code.store(code.constant(0.0, self.type), self._watch, c * self.width)
-        super().open(rows, begin, n_rows, given, own)
+    A chunk need not wait for the one before, whose chain of operations goes on meanwhile.
+    """
 
-    def place(self, room: Room, k: Value) -> Value:
-        c = self.code.op("sdiv", INT, k, self.code.constant(self.width, INT))
-        return self.code.at(room.state, c * ((self._n - 1) * self.width) + k)
-
-    def _each(self, room: Room, body: Callable[[list[Value], Value], Sequence[Value]]) -> None:
-        code, n, width = self.code, self._n, self.width
-        with code.over(self._used) as c:
-            start = code.at(room.state, c * (n * width))
-            for i, x in enumerate(body([code.load(start, i * width, self.type) for i in range(n)], c)):
-                code.store(x, start, i * width)
-
-    def change(self, column: ColumnStage, j: Value, step: Value, end: bool = False) -> None:  # type: ignore[override]
-        room = self._end if end else self._running
-        if self._own:
-            self._each(room, lambda x, c: column(j, x, step, c))
-        else:
-            each = lambda body: self._each(room, lambda x, _: body(x))  # noqa: E731
-            self._over(each, column.numbers(j), column.kind(j), step)
-
-    def look(self, look: Callable[[Any], Any]) -> None:
-        self._each(self._running, lambda x, _: look(x))
-
-    def remember(self) -> None:
-        """A single trajectory alone goes back."""
+    def __init__(
+        self, code: Code, n_values: int, n_out: int, width: int, own: bool = False, over: Over | None = None
+    ) -> None:
+        self.code, self.width, self.n_values, self.n_out = code, width, n_values, n_out
+        self._own, self._over, self._lanes = own, over, Lanes(code, n_values, width)
+        self._remembers = width == 1  # a single trajectory alone goes back
+        self.chunks = 1 if over is None else min(max(FAST_MEMORY // (16 * n_values * width), 1), MOST_CHUNKS)
+        sizes, type = [n_values * self.chunks] * 3 + [self.chunks], self._lanes.type
+        self._running, self._end, self._before, self._watch = (Rows(code.memory(n, type), type) for n in sizes)
 
     @contextmanager
-    def _blocks(self) -> Iterator[tuple[Value, Type]]:
-        with self.code.over(self._used * self._n) as i:
-            yield i * self.width, self.type
+    def _each(self) -> Iterator[Any]:
+        if self.chunks == 1:
+            yield 0
+            return
+        with self.code.over(self._used) as c:
+            yield c
+
+    def _values(self, rows: Rows, c: Any) -> list[Value]:
+        return [rows[c * self.n_values + i] for i in range(self.n_values)]
+
+    def _put(self, rows: Rows, c: Any, values: Sequence[Any]) -> None:
+        for i, x in enumerate(values):
+            rows[c * self.n_values + i] = x
+
+    def open(self, rows: Value, begin: Value, n_rows: Value, given: int | None = None, own: int = 0) -> None:
+        """Read states; numbers behind those that are given are 0."""
+        given = self.n_values if given is None else given
+        lanes = self._lanes if given + own == self.n_values else Lanes(self.code, given + own, self.width)
+        if self.chunks > 1:
+            chunks = self.code.constant(self.chunks, INT)
+            self._used = self.code.apply("min", (groups(self.code, n_rows - begin, self.width), chunks))
+        self._revive()
+        with self._each() as c:
+            x = lanes.loaded(rows, begin + c * self.width, n_rows)[:given]
+            self._put(self._running, c, [*x, *[0.0] * (self.n_values - given)])
+
+    def change(self, column: Callable[..., Any], j: Value, step: Value, end: bool = False) -> None:
+        room = self._end if end else self._running
+
+        def each(body: Callable[..., Sequence[Value]]) -> None:
+            with self._each() as c:
+                self._put(room, c, body(self._values(room, c), *[c] * (self.chunks > 1 and self._own)))
+
+        if self._over is None or self._own:
+            each(lambda x, *chunk: column(j, x, step, *chunk))
+        else:
+            assert isinstance(column, ColumnStage)
+            self._over(each, column.numbers(j), column.kind(j), step)
+
+    def record(self, history: _History, s: Value) -> None:
+        """Keep the state before stage s."""
+        start = history.place(s)
+        for i, x in enumerate(self._values(self._running, 0)):
+            self.code.store(x, start, i * self.width)
+
+    def look(self, look: Callable[[Any], Any]) -> None:
+        with self._each() as c:
+            self._put(self._running, c, look(self._values(self._running, c)))
+
+    def _revive(self) -> None:
+        with self._each() as c:
+            self._watch[c] = 0.0
+
+    def _copy(self, source: Any, target: Any) -> None:
+        with self._each() as c:
+            self._put(target, c, self._values(source, c))
 
     def finite(self) -> Value:
-        """True if a trajectory was finite up to now."""
-        code, zero = self.code, self.code.constant(0.0, self.type)
+        """True if the end of a trajectory is finite, as it was up to now: times 0 they are 0."""
+        code, zero = self.code, self.code.constant(0.0, self._lanes.type)
         alive = code.variable(code.constant(0, BOOL))
-        with code.over(self._used) as c:
-            total = code.load(self._watch, c * self.width, self.type)
-            start = code.at(self._end.state, c * (self._n * self.width))
-            for i in range(self._n):
-                total = code.fma(code.load(start, i * self.width, self.type), zero, total)
-            code.store(total, self._watch, c * self.width)
+        with self._each() as c:
+            total = self._watch[c]
+            for x in self._values(self._end, c):
+                total = code.fma(x, zero, total)
+            self._watch[c] = total
             alive.value = alive.value | code.any(code.apply("eq", (total, 0.0)))
         return alive.value
 
+    def _write(self, room: Any, n: Any, out: Value, begin: Value, n_rows: Value, stride: Value, at: Value) -> None:
+        with self._each() as c:
+            self._lanes.store(self._values(room, c)[:n], out, begin + c * self.width, n_rows, stride, at)
+
     def mark(self, n: Value, finite: Value, begin: Value, n_rows: Value) -> None:
         """Write n for the trajectories that are alive, else −1."""
-        code = self.code
-        with code.over(code.apply("min", (self.count, n_rows - begin))) as i:
-            alive = code.apply("eq", (code.load(self._watch, i), 0.0))
-            code.store(code.select(alive, n, code.constant(-1, INT)), finite, begin + i)
-
-
-def _state(
-    code: Code,
-    n_values: int,
-    n_out: int,
-    width: int,
-    memory: Callable[..., Memory] | None,
-    arguments: Sequence[Value],
-    before: bool = False,
-) -> _Registers | Memory:
-    if memory is None:
-        return _Registers(code, n_values, n_out, width)
-    return memory(code, width, arguments, before)
+        with self._each() as c:
+            alive = self.code.apply("eq", (self._watch[c], 0.0))
+            _mark(self.code, alive, n, finite, begin + c * self.width, n_rows)
 
 
 def _no_stage(*_: Any) -> Any:
