@@ -506,7 +506,6 @@ def made(line: str) -> Any:
         as_method(one, flow.requires_grad_(False), flow.dt)
         copy.deepcopy(flow).float()(0.3 * flow.dt, x.float())
         (c := flow.certificate(one, states=20, times=4, held_out=3, t_end=3 * flow.dt), str(c))
-        flow.scheme(0.3 * flow.dt)
     """
     make, one = partial(eval, maker), getattr(S, name)
     flow = shaken(make())
