@@ -147,9 +147,6 @@ def test_every_public_name_is_in_the_reference():
         assert home is None or any(words in reference for words in known), name
 
 
-RAW_TEX = re.compile(r"\$[^$\n]*[\\_^][^$\n]*\$|\\(frac|bar|nabla|partial|mathcal|sum|int)(?![a-z])|\\[()\[\]]")
-
-
 class Page(HTMLParser):
     """A page of the site as a reader gets it: its words without code, and where its links, images and scripts lead."""
 

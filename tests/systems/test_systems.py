@@ -126,14 +126,6 @@ def test_every_scene_is_documented(name):
     )
 
 
-def test_parameters_of_a_scene_on_the_command_line():
-    (scene,) = scenes(["spring-pendulum", "--k", "1e4", "--coordinates=polar"])
-    assert not scene.system.separable
-    assert scene.system.params["k"] == 1e4
-    assert scene.key == "spring-pendulum-k=10000-coordinates=polar"
-    assert scenes(["fput:omega=10:m=2"])[0].system.ndof == 4
-
-
 def test_kepler_comes_back_after_every_period():
     for e in (0.0, 0.3, 0.6):
         system = systems.kepler(e)
@@ -265,12 +257,6 @@ def test_the_toda_lattice_keeps_the_eigenvalues_of_laxs_matrix(n):
     if n > 2:
         np.testing.assert_allclose((eigenvalues**2).sum(-1), (system.hamiltonian(system.y0) + n) / 2, rtol=1e-11)
     assert system.domain.contains(sol.states).all()
-
-
-def test_the_toda_lattice_has_no_quadratic_terms():
-    """exp(q₁ − q₂) is no monomial."""
-    with pytest.raises(ValueError, match=r"^`system` 'toda_lattice' has no linear part"):
-        solve(systems.toda_lattice(), "impulse", (0, 1))
 
 
 def test_the_toda_lattice_of_three_is_henon_heiles_to_third_order():
