@@ -5,7 +5,8 @@
     python tests/mutations.py --only tangent      # those whose names match
 
 A mutation is a text of the package and what is put in its place. It is found by its content in whatever file it stands.
-Each names tests that must fail, again by name alone. Tests run with `-x` in a copy, in a folder of compiled loops of its own, so nothing of the tree is changed.
+Each names tests that must fail, again by name alone. Tests run with `-x` in a copy, in a folder of compiled loops of
+its own, so nothing of the tree is changed.
 Exit status 1 if a mutation survives, or is found nowhere.
 """
 
