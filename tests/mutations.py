@@ -109,8 +109,8 @@ MUTATIONS = (
     ),
     Mutation(
         "time of a secant",
-        "tolerance = 4 * eps * np",
-        "tolerance = 4e7 * eps * np",
+        "for _ in range(80):\n        x = step(sigma)",
+        "for _ in range(2):\n        x = step(sigma)",
         ("test_the_time_of_an_output_is_met_to_rounding",),
     ),
     Mutation(
