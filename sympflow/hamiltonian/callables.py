@@ -72,17 +72,11 @@ class CallableHamiltonian(Definition):
         self._functions = functions
         if _is_numba(gradient):
             _check_numba(potential, gradient, hessian_vector, "t, " * timed)
-            self.numba_functions = potential, gradient, hessian_vector
-        of_arrays = [None if f is None else _OverTimes(f) if timed else f for f in self._of_states]
+            self.numba_functions = given = potential, gradient, hessian_vector
+            V, slope, product = (NumbaFunction(given, order) for order in range(3))
+            functions = V, None, slope, None if hessian_vector is None else product
+        of_arrays = [None if f is None else _OverTimes(f) if timed else f for f in functions]
         self._potential, self._hamiltonian, self._gradient, self._hessian_vector = of_arrays
-
-    @property
-    def _of_states(self) -> Sequence[Any]:
-        """V, H, the gradient and the product as functions of arrays of states, the time first."""
-        if self.numba_functions is None:
-            return self._functions
-        V, gradient, product = (NumbaFunction(self.numba_functions, order) for order in range(3))
-        return V, None, gradient, None if self.numba_functions[2] is None else product
 
     def identity_parts(self) -> Any:
         return [self.ndof, self._functions] if self.timed else [self.ndof, *self._functions]

@@ -55,7 +55,6 @@ class Definition:
     untraced: str = ""  # the reason for which they could not, a clause, known after `form`
     given_functions: bool = False  # of Python, which are traced where that is possible
     instead: str = "an implicit method such as 'gauss_legendre6', or a Runge–Kutta method"
-
     _generated: tuple[str, ...] = ("_functions",)  # what cannot be pickled, and is made again
 
     def __getstate__(self) -> dict[str, Any]:

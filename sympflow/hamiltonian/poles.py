@@ -322,7 +322,6 @@ _SINGULAR: dict[Any, Callable[..., Sequence[sp.Expr]]] = {
     sp.besselk: lambda n, a: [a],
 }
 """Expressions that vanish where a function is infinite, or ends."""
-
 _ENDING = sp.log, sp.asin, sp.acos, sp.acosh, sp.atanh, sp.LambertW, sp.elliptic_k, sp.elliptic_e
 _ODD = sp.sinh, sp.tanh, sp.asinh, sp.atan, sp.erf, sp.sign
 

@@ -48,8 +48,6 @@ SHOWN_NAMES = (
 """The attributes that `dir` lists: those that users need. All others are for methods and studies."""
 MOST_WRITTEN_OUT = 400
 """Coordinates of an expression before a warning: 512 of a chain take 2 s to define, and a step 14 times as long."""
-
-
 UNNAMED = "custom"
 MEANT = {
     **dict.fromkeys(("dim", "dimension", "dimensions"), "degrees of freedom of a function are `ndof`, of pairs `dim`"),
@@ -240,7 +238,6 @@ class HamiltonianSystem(Hamiltonian, Answering):
         **dict.fromkeys(("grad", "jac"), "`gradient(y)`, or `hessian(y)`"),
         "parameters": "`params`",
     }
-
     _period: float | None = None
     _former_period: float | None = None
     _continuous = True  # False of systems that are made of others, whose H may jump where solutions do not feel it

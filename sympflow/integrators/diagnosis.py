@@ -34,7 +34,6 @@ LOST = 0.01  # of y·∇H: a state whose energy differs by more is no longer on 
 SHORT = 1e-11  # of the way: steps below it go on no more
 NEAR, NEARER, GROWTH = 1e-3, 1e-8, 10.0
 """The state is infinite at the end if it grows by so much from this to that part of the way before it."""
-
 LOOKED_AT, LOOKED_AT_TOGETHER = 32, 4096  # outputs of one trajectory, states of all, at which H and signs are compared
 OFF, FAR_OFF = 0.01, 0.5  # of the kinetic energy: a change of H after which steps are looked at; where H may change
 MOST_WALKED, MOST_TESTED, MOST_NAMED = 4 * 10**6, 32, 64  # numbers of a run executed again; crossings; trajectories
@@ -42,8 +41,6 @@ ACROSS, AROUND, PARTS = 0.25, 8, 9
 """A step leaps if, at one of so many points on it, what vanishes is so small a part of what it is at another; around it
 H changes by more than a tenth of the kinetic energy within so many steps."""
 LOST_AROUND = 0.1
-
-
 TOO_LONG = 0.05  # energy error, over the size of the energy, of a run whose step is too long
 PHASES, PHASE_ERROR = np.geomspace(1e-3, 3.0, 400), 0.01
 """Where energy is not kept, a step is too long if an oscillation is off by so much of a radian, or beyond the last."""
@@ -55,7 +52,6 @@ FEWEST_NEAR, LOST_DIGITS = 100, 1e-9
 that share of errors there is told."""
 STATES_COMPARED, MOST_COMPARED = 16, 64
 """Outputs of a run, and states of a batch, at which H is compared with that of the flow."""
-
 MANY_TIMES = 1000.0  # times the certified energy error of a flow beyond which an error outside its domain is warned of
 _TOLD: WeakSet[Any] = WeakSet()
 
@@ -676,16 +672,6 @@ def check_start(flow: KnownFlow, system: HamiltonianSystem, y0: Array, compiled:
         )
 
 
-def _meaning(flow: KnownFlow | None) -> str:
-    """The worth of a trained flow outside its domain: a primed one still evaluates the system's own forces there."""
-    if flow is None or any(flow.evaluations(1, 1, 0, "array").values()):
-        return ""
-    return (
-        ", where its network was not trained: it stays finite, even past a singularity, and what it gives from that "
-        "time on means nothing. Start inside the domain, or use a classical method"
-    )
-
-
 def check_domain(outcome: Outcome, integrator: Integrator, system: HamiltonianSystem, action: str) -> None:
     """Note the first output outside the domain, or end the run there."""
     flow = integrator.known_flow(system)
@@ -712,8 +698,14 @@ def check_domain(outcome: Outcome, integrator: Integrator, system: HamiltonianSy
         which = f" (trajectory {', '.join(map(str, index))}, the first of {count})"
     note = f"The state left the domain at t = {t:.15g}{which}"
     if action == "warn":
+        worth = ""
+        if flow is not None and not any(flow.evaluations(1, 1, 0, "array").values()):  # else forces of the system
+            worth = (
+                ", where its network was not trained: it stays finite, even past a singularity, and what it gives from "
+                "that time on means nothing. Start inside the domain, or use a classical method"
+            )
         held = "the figures" if flow is None or flow.certified is None else "the figures and the certificate"
-        outcome.message += f" {note}: {held} of a trained flow do not hold there{_meaning(flow)}."
+        outcome.message += f" {note}: {held} of a trained flow do not hold there{worth}."
         return
     outcome.message = f"{note}. Start inside the domain, or pass on_domain_exit='warn'."
     if inside.ndim == 1:
