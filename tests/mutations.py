@@ -111,7 +111,7 @@ MUTATIONS = (
         "time of a secant",
         "for _ in range(80):\n        x = step(sigma)",
         "for _ in range(2):\n        x = step(sigma)",
-        ("test_the_time_of_an_output_is_met_to_rounding",),
+        ("test_it_is_right_in_the_physical_time",),
     ),
     Mutation(
         "place of a time on the grid",

@@ -14,7 +14,6 @@ from sympflow.integrators.methods import NAMES
 
 pytestmark = pytest.mark.slow
 
-PENDULUM = systems.pendulum()
 OSCILLATOR = systems.harmonic_oscillator()
 METHODS = sorted(m for m in NAMES if getattr(get(m), "splitting", "") != "kepler")
 FIXED = [m for m in METHODS if "dt" in get(m).options() and getattr(get(m), "on_grid", True) and not get(m).trained]

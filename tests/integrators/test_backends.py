@@ -10,7 +10,7 @@ from sympflow.integrators.steppers import compiled_loops
 from sympflow.schemes import SCHEMES
 
 HH = systems.henon_heiles()
-PLAIN = HamiltonianSystem(lambda q: (np.sort(q) ** 4).sum(-1), ndof=1, y0=[1.0, 0.0], gradient=lambda q: 4 * q**3)
+PLAIN = HamiltonianSystem(lambda q: np.median(q, axis=-1) ** 4, ndof=1, y0=[1.0, 0.0], gradient=lambda q: 4 * q**3)
 TRACED = HamiltonianSystem(lambda q: (q**4).sum(-1), ndof=1, y0=[1.0, 0.0])
 AIRY = HamiltonianSystem.from_sympy("p**2/2 - airyai(q)", y0=[1.0, 0.0])
 
@@ -69,7 +69,7 @@ def test_auto_chooses_what_applies(system, arguments, backend):
             {"backend": "compiled", "y0": torch.tensor(HH.y0, requires_grad=True), "method": "tao4"},
             r"^`backend` 'compiled' .* `y0` ",
         ),
-        (PLAIN, {"backend": "compiled"}, r"^`backend` 'compiled' .* functions could not be traced: numpy\.sort"),
+        (PLAIN, {"backend": "compiled"}, r"^`backend` 'compiled' .* functions could not be traced: numpy\.median"),
         (AIRY, {"backend": "compiled"}, r"^`backend` 'compiled' does not apply"),
         (PLAIN, {"compensated": True}, r"^`compensated` sums need compiled loops"),
         (HH, {"backend": "array", "compensated": True}, r"^`compensated` sums need compiled loops"),
