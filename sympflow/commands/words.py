@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import wraps
 from pathlib import Path
-from typing import Annotated, Any, overload
+from typing import Annotated, Any
 
 import numpy as np
 import typer
@@ -390,16 +390,8 @@ def _pairs(words: Sequence[str]) -> list[tuple[str, str]]:
     return list(found.items())
 
 
-@overload
-def state(words: str) -> np.ndarray: ...
-
-
-@overload
-def state(words: None) -> None: ...
-
-
-def state(words: str | None) -> np.ndarray | None:
-    """A state from ``0.3,-0.3,0.3,0.15``."""
+def state(words: str | None) -> Any:
+    """A state from ``0.3,-0.3,0.3,0.15``, an array; None without any words."""
     if words is None:
         return None
     return np.array([_float("--y0", word) for word in re.split(r"\s*[,\s]\s*", words.strip("[]() "))])

@@ -354,5 +354,4 @@ class Ensemble(Shown):
             If pandas or xarray is not installed.
         """
         imported("pandas", "to_dataframe()")
-        data = self.to_xarray()
-        return names.table(data, (*map(axis_name, self.params), ORBIT, TIME))
+        return names.table(self.to_xarray(), (*map(axis_name, self.params), ORBIT, TIME))

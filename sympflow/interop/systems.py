@@ -188,8 +188,7 @@ def _probes(ndof: int, y0: ArrayLike | None) -> Tensor:
         what = f"shape {center.shape}" if center.shape != (2 * ndof,) else "NaN or infinity"
         raise ValueError(f"`y0` must be {2 * ndof} finite numbers, [q, p] for ndof = {ndof}; got {what}. Correct it.")
     spread = 0.25 * np.maximum(np.abs(center).max(initial=0.0), 1.0)
-    noise = np.random.default_rng(20260101).uniform(-1, 1, (8, 2 * ndof))
-    return torch.from_numpy(center + spread * noise)
+    return torch.from_numpy(center + spread * np.random.default_rng(20260101).uniform(-1, 1, (8, 2 * ndof)))
 
 
 def _mass(hessian: Tensor, gradient: Callable[[Tensor], Tensor], probes: Tensor) -> np.ndarray | None:

@@ -31,11 +31,8 @@ State = Tensor | tuple[Tensor, ...]
 _THEIRS = {*ADAPTIVE, *FIXED, "explicit_adams", "implicit_adams", "fixed_adams", "scipy_solver"}
 _RTOL, _ATOL = 1e-7, 1e-9
 _CALLBACKS = (  # callbacks of torchdiffeq for adaptive steps and its adjoint equation, which our methods have not
-    "callback_accept_step",
-    "callback_reject_step",
-    "callback_step_adjoint",
-    "callback_accept_step_adjoint",
-    "callback_reject_step_adjoint",
+    *("callback_accept_step", "callback_reject_step", "callback_step_adjoint"),
+    *("callback_accept_step_adjoint", "callback_reject_step_adjoint"),
 )
 _LATE = 1000.0  # time after the start in which an event is expected
 _CHECKPOINTS = 5  # outputs of a run at which another right-hand side is compared

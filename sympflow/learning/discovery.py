@@ -440,8 +440,7 @@ class _Search:
         self.floor = FLOOR * data.scales
         self.penalty = math.log(max(data.n_values, 3)) + 2 * math.log(K)
         self.rate = float(np.sqrt(np.mean((self.smooth.slopes / data.scales) ** 2)))
-        longest = max(run.span for run in data.runs)
-        self.rate = max(self.rate, 1e-3 / longest)
+        self.rate = max(self.rate, 1e-3 / max(run.span for run in data.runs))
         self.piece = RADIANS / self.rate if piece is None else piece
         self.refined = 0
         self._begin()

@@ -181,8 +181,7 @@ def steppers(model: Field) -> list[Stepper]:
         return [model.stepper]
     if not model.separable:
         return [Gauss(s) for s in STAGES]
-    schemes = map(scheme_named, SPLITTINGS)
-    return [Splitting(s) for s in schemes if model.nystrom or not s.nystrom]
+    return [Splitting(s) for s in map(scheme_named, SPLITTINGS) if model.nystrom or not s.nystrom]
 
 
 @dataclass(frozen=True)

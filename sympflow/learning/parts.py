@@ -137,8 +137,7 @@ class Polynomial(Sum):
     @classmethod
     def up_to(cls, degree: int, of: str, scales: Any) -> Polynomial:
         """All monomials of degree 1 to `degree`."""
-        m = len(scales)
-        exponents = [e for e in product(range(degree + 1), repeat=m) if 0 < sum(e) <= degree]
+        exponents = [e for e in product(range(degree + 1), repeat=len(scales)) if 0 < sum(e) <= degree]
         return cls(of, sorted(exponents, key=lambda e: (sum(e), e[::-1])), scales)
 
     @cached_property

@@ -93,8 +93,7 @@ class Normal:
     def gains(self, fitted: np.ndarray) -> np.ndarray:
         """Decrease of |r|² (n,) by the linear model, when one number joins those that were fitted; 0 of these."""
         S, g = self.reduced()
-        inner = S[np.ix_(fitted, fitted)]
-        found = np.linalg.solve(inner, np.column_stack([S[fitted], g[fitted]]))
+        found = np.linalg.solve(S[np.ix_(fitted, fitted)], np.column_stack([S[fitted], g[fitted]]))
         curvature = np.diag(S) - np.einsum("ak,ak->k", S[fitted], found[:, :-1])
         slope = g - S[:, fitted] @ found[:, -1]
         usable = ~fitted & (curvature > 1e-10 * np.diag(S))

@@ -153,8 +153,7 @@ class _Search:
         """The end (N, 2d) of the last chunk of steps, run again: a single step would differ from it in rounding."""
         n, step = len(y), float(h[-1])
         with np.errstate(all="ignore"):
-            piece = Problem(self.system, float(t[0]), float(t[-1]) + step, y[0])
-            stepper = self.integrator.stepper(piece)
+            stepper = self.integrator.stepper(Problem(self.system, float(t[0]), float(t[-1]) + step, y[0]))
             states, _ = stepper.rollout(y[0], step, n, np.arange(n + 1), float(t[0]))
             end = states[-1] if step == grid.h else stepper.shorter(y[0], step, float(t[0]))
         return np.asarray(end)

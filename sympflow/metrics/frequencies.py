@@ -252,8 +252,7 @@ def _lines_of(z: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
     if known > 1:
         a = _projected(basis, window, z)
         for k in 2 * [*range(known)]:  # each with the others taken off
-            others = z - np.delete(a, k) @ np.delete(basis, k, axis=0)
-            angles[k] = _refined(others, window, s, angles[k])
+            angles[k] = _refined(z - np.delete(a, k) @ np.delete(basis, k, axis=0), window, s, angles[k])
             basis[k] = np.exp(1j * angles[k] * s)
             a = _projected(basis, window, z)
     if known:

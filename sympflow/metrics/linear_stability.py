@@ -355,8 +355,7 @@ def _quadratic(system: HamiltonianSystem, y0: np.ndarray) -> bool:
     size = float(np.abs(scale * y0).max()) or 1.0
     states = np.concatenate([size * s * rng.standard_normal((8, y0.size)) / scale for s in SCALES])
     hessians = np.asarray(system.hessian(states)) / np.outer(scale, scale)
-    spread = np.abs(hessians - hessians[0]).max()
-    return bool(spread <= 1e-12 * np.abs(hessians[0]).max())
+    return bool(np.abs(hessians - hessians[0]).max() <= 1e-12 * np.abs(hessians[0]).max())
 
 
 def of_method(

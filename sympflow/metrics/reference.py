@@ -151,5 +151,4 @@ def _linear_flow(system: HamiltonianSystem, t: np.ndarray, y0: np.ndarray) -> np
     frequency, U = np.linalg.eigh(-1j * (L.T @ J @ L))  # z(t) = U exp(i ω t) U* z(0)
     z0 = (y0 @ L) @ U.conj()
     z = z0[..., None, :] * np.exp(1j * t[:, None] * frequency)
-    y = np.real(z @ U.T) @ np.linalg.inv(L)
-    return np.moveaxis(y, -2, -1)
+    return np.moveaxis(np.real(z @ U.T) @ np.linalg.inv(L), -2, -1)

@@ -247,8 +247,7 @@ def _errors(
             return None
         for one in runs:
             attempts.accuracy(one, truth)
-        found = [one.row.error for one in runs if one.row.error is not None]
-        target = min(found, default=math.inf) / 100
+        target = min([one.row.error for one in runs if one.row.error is not None], default=math.inf) / 100
         if truth.accuracy is None or given is not None or truth.accuracy <= target:
             break
     for one in runs:
@@ -379,15 +378,8 @@ class Comparison(Report):
     columns: ClassVar[tuple[str, ...]] = (
         *("system", "method", "label", "status", "reason", "dt", "tolerance", "backend", "run_time", "run_time_spread"),
         *("compile_time", "force_evaluations", "hessian_evaluations", "error", "energy_error", "balance_error"),
-        *(
-            "energy_drift",
-            "energy_drift_error",
-            "volume_error",
-            "symplecticity_defect",
-            "conformal_defect",
-            "time_reversal_error",
-        ),
-        "training_time",
+        *("energy_drift", "energy_drift_error", "volume_error", "symplecticity_defect", "conformal_defect"),
+        *("time_reversal_error", "training_time"),
     )
 
     system: HamiltonianSystem

@@ -240,9 +240,7 @@ def _module(file: Path) -> ModuleType:
 def _run(file: Path) -> ModuleType:
     """The module of a Python file, run once, with its folder on the path as for a script."""
     name = f"sympflow_user_file_{file.stem}"
-    spec = importlib.util.spec_from_file_location(name, file)
-    assert spec is not None
-    assert spec.loader is not None
+    spec: Any = importlib.util.spec_from_file_location(name, file)
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module  # pickles and dataclasses look it up
     if str(file.parent) not in sys.path:

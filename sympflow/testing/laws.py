@@ -200,10 +200,8 @@ def symplecticity_as_declared(integrator: Integrator, system: HamiltonianSystem)
         assert defect > low, f"AᵀJA = J to {defect:.1e}: declare `symplectic = True`"
 
 
-def _jacobian(
-    step: Callable[[np.ndarray, np.ndarray], np.ndarray], y: np.ndarray, h: np.ndarray, reach: float = 0.02
-) -> np.ndarray:
-    """The Jacobians (n, 2d, 2d) of steps from y (n, 2d), by differences of order 8: to about 1e-12."""
+def _jacobian(step: Callable[[np.ndarray, Any], np.ndarray], y: np.ndarray, h: Any, reach: float = 0.02) -> np.ndarray:
+    """The Jacobians (n, ..., 2d) of steps from y (n, 2d), by differences of order 8: to about 1e-12."""
     columns = []
     for i, scale in enumerate(np.abs(y).max(0)):
         e = np.zeros(y.shape[-1])
@@ -224,12 +222,8 @@ def the_inverse_undoes_the_step(integrator: Integrator, system: HamiltonianSyste
 
 
 OF_STEPS: tuple[Callable[[Integrator, HamiltonianSystem], None], ...] = (
-    a_step_length_for_each_state,
-    what_is_not_finite_stays_so,
-    the_order_is_the_slope,
-    the_tangent_is_the_derivative_of_the_step,
-    symplecticity_as_declared,
-    the_inverse_undoes_the_step,
+    *(a_step_length_for_each_state, what_is_not_finite_stays_so, the_order_is_the_slope),
+    *(the_tangent_is_the_derivative_of_the_step, symplecticity_as_declared, the_inverse_undoes_the_step),
 )
 
 
@@ -294,15 +288,10 @@ def dtype_device_and_gradient_of_tensors(integrator: Integrator, system: Hamilto
 def _gradient_by_differences(integrator: Integrator, system: HamiltonianSystem, y0: np.ndarray) -> np.ndarray:
     """The gradient (n, 2d) of the sum of the states at 0.05 and 0.1, from y0 (n, 2d)."""
 
-    def total(y: np.ndarray) -> np.ndarray:
+    def total(y: np.ndarray, h: Any) -> np.ndarray:
         return run(integrator, system, (0.0, 0.1), y, t_eval=[0.05, 0.1]).y.sum((-2, -1))
 
-    columns = []
-    for i in range(y0.shape[-1]):
-        e = np.zeros(y0.shape[-1])
-        e[i] = 0.01
-        columns.append(sum(c * (total(y0 + k * e) - total(y0 - k * e)) for k, c in DIFFERENCES) / e[i])
-    return np.stack(columns, axis=-1)
+    return _jacobian(total, y0, None)
 
 
 def dense_output_equals_the_outputs(integrator: Integrator, system: HamiltonianSystem) -> None:
@@ -431,17 +420,9 @@ def _the_count_of_a_step(integrator: Integrator, system: HamiltonianSystem) -> N
 
 
 OF_RUNS: tuple[Callable[[Integrator, HamiltonianSystem], None], ...] = (
-    declarations,
-    dtype_and_shape_of_arrays,
-    dtype_device_and_gradient_of_tensors,
-    dense_output_equals_the_outputs,
-    the_end_is_reached,
-    both_directions,
-    an_empty_interval,
-    a_blow_up_is_status_minus_one,
-    a_batch_is_the_loop,
-    events_are_zeros_of_the_dense_output,
-    statistics,
+    *(declarations, dtype_and_shape_of_arrays, dtype_device_and_gradient_of_tensors, dense_output_equals_the_outputs),
+    *(the_end_is_reached, both_directions, an_empty_interval, a_blow_up_is_status_minus_one, a_batch_is_the_loop),
+    *(events_are_zeros_of_the_dense_output, statistics),
 )
 
 
@@ -528,27 +509,27 @@ def friction_is_in_the_steps(integrator: Integrator, system: HamiltonianSystem) 
     """A method that says `takes_friction` solves a damped system, to its order: nearer to it than to that without."""
     if not integrator.takes_friction:
         raise NotApplicable("it does not say that it takes friction, so damped systems are refused for it")
-    damped, end, effect = _damped()
-    try:
-        integrator.check(damped)
-    except ValueError as reason:
-        raise NotApplicable(f"it does not apply to the default system with friction ({reason})") from None
-    sol = run(integrator, damped, (0.0, T_END), t_eval=[T_END], backend="array")
-    error = float(np.abs(sol.y[..., 0] - end).max())
-    assert error < effect / 4, (
-        f"the end of a damped system is wrong by {error:.1e}, and friction moves it by {effect:.1e}: take −Γp into "
-        "every step, as system.vector_field does, or do not say `takes_friction`"
+    _solves(
+        *(integrator, _damped(), 0.0, "friction", "a damped system", "friction moves it"),
+        "take −Γp into every step, as system.vector_field does, or do not say `takes_friction`",
     )
-    _the_order_is_kept(integrator, damped, "with friction")
 
 
-def _the_order_is_kept(integrator: Integrator, system: HamiltonianSystem, what: str, t: float = 0.0) -> None:
-    """The error of one step from t on falls as fast as declared, of a method that has a bare step and an order."""
+def _solves(integrator: Integrator, case: tuple[HamiltonianSystem, np.ndarray, float], t0: float, *words: str) -> None:
+    """A method solves a system from t0, to its order and nearer to its end than to that without what is in words."""
+    (system, end, effect), (what, named, moves, remedy) = case, words
+    try:
+        integrator.check(system)
+    except ValueError as reason:
+        raise NotApplicable(f"it does not apply to the default system with {what} ({reason})") from None
+    sol = run(integrator, system, (t0, t0 + T_END), t_eval=[t0 + T_END], backend="array")
+    error = float(np.abs(sol.y[..., 0] - end).max())
+    assert error < effect / 4, f"the end of {named} is wrong by {error:.1e}, and {moves} by {effect:.1e}: {remedy}"
     if integrator.order is None or bare_step(integrator, system) is not None:
         return
-    slopes = _slopes_of_steps(integrator, system, t, to_an_octave=2)  # high orders settle just before rounding
+    slopes = _slopes_of_steps(integrator, system, t0, to_an_octave=2)  # high orders settle just before rounding
     assert not slopes or slopes[-1] - integrator.order > -0.6, (
-        f"{what} the order is {slopes[-1]:.2f}, and {integrator.order} is declared"
+        f"with {what} the order is {slopes[-1]:.2f}, and {integrator.order} is declared"
     )
 
 
@@ -563,30 +544,19 @@ def _driven() -> tuple[HamiltonianSystem, np.ndarray, float]:
     scene: dict[str, Any] = {"y0": system.y0, "dt": system.dt, "name": "driven"}
     H = f"{system.symbols.H} + q1*cos(2*t)/5"
     driven = HamiltonianSystem.from_sympy(H, time="t", **scene)
-    t0 = DRIVEN_FROM
-    end = solve(driven, "dop853", (t0, t0 + T_END), t_eval=[t0 + T_END], rtol=1e-13, atol=1e-15).y[..., 0]
-    frozen = [HamiltonianSystem.from_sympy(H.replace("2*t", repr(2 * t)), **scene) for t in (0.0, t0)]
-    others = [exact(other) for other in (system, *frozen)]
-    return driven, end, float(min(np.abs(end - other).max() for other in others))
+    end = exact(driven, t0=DRIVEN_FROM)
+    frozen = [HamiltonianSystem.from_sympy(H.replace("2*t", repr(2 * t)), **scene) for t in (0.0, DRIVEN_FROM)]
+    return driven, end, float(min(np.abs(end - exact(other)).max() for other in (system, *frozen)))
 
 
 def the_drive_is_in_the_steps(integrator: Integrator, system: HamiltonianSystem) -> None:
     """A method that says `takes_driving` solves a driven system, to its order: nearer to it than to one held fixed."""
     if not integrator.takes_driving:
         raise NotApplicable("it does not say that it takes H at its times, so driven systems are refused for it")
-    driven, end, effect = _driven()
-    try:
-        integrator.check(driven)
-    except ValueError as reason:
-        raise NotApplicable(f"it does not apply to the default system with a drive ({reason})") from None
-    t1 = DRIVEN_FROM + T_END
-    sol = run(integrator, driven, (DRIVEN_FROM, t1), t_eval=[t1], backend="array")
-    error = float(np.abs(sol.y[..., 0] - end).max())
-    assert error < effect / 4, (
-        f"the end of a driven system is wrong by {error:.1e}, and that the drive moves matters by {effect:.1e}: take H "
-        "at t + c·h in every stage, as system.vector_field(y, t + c * h) does, or do not say `takes_driving`"
+    _solves(
+        *(integrator, _driven(), DRIVEN_FROM, "a drive", "a driven system", "that the drive moves matters"),
+        "take H at t + c·h in every stage, as system.vector_field(y, t + c * h) does, or do not say `takes_driving`",
     )
-    _the_order_is_kept(integrator, driven, "with a drive", DRIVEN_FROM)
 
 
 def the_start_time_does_not_matter(integrator: Integrator, system: HamiltonianSystem) -> None:
@@ -688,12 +658,7 @@ def a_batch_reports_its_failures(integrator: Integrator, system: HamiltonianSyst
 
 
 OF_CONSISTENCY: tuple[Callable[[Integrator, HamiltonianSystem], None], ...] = (
-    the_run_is_its_steps,
-    states_within_a_step_belong_to_it,
-    the_start_time_does_not_matter,
-    friction_is_in_the_steps,
-    the_drive_is_in_the_steps,
-    every_event_is_found,
-    save_every_thins_the_outputs,
+    *(the_run_is_its_steps, states_within_a_step_belong_to_it, the_start_time_does_not_matter),
+    *(friction_is_in_the_steps, the_drive_is_in_the_steps, every_event_is_found, save_every_thins_the_outputs),
     a_batch_reports_its_failures,
 )
