@@ -175,10 +175,8 @@ def scenes(words: Sequence[str] | None, own: Sequence[str] | None = None) -> lis
 def _told_apart(found: list[Scene]) -> list[Scene]:
     """The scenes with keys that differ, so that none overwrites the files of another."""
     keys = [scene.key for scene in found]
-    numbers = [keys[:i].count(key) + 1 for i, key in enumerate(keys)]
-    return [
-        scene if n == 1 else replace(scene, key=f"{scene.key}-{n}") for scene, n in zip(found, numbers, strict=True)
-    ]
+    nth = [keys[:i].count(key) + 1 for i, key in enumerate(keys)]
+    return [scene if n == 1 else replace(scene, key=f"{scene.key}-{n}") for scene, n in zip(found, nth, strict=True)]
 
 
 def shown(value: Any) -> str:

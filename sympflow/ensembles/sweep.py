@@ -196,9 +196,7 @@ def ensemble(
     return Ensemble(layout.times, axes, system, integrator, (t0, t1), orbits, keeper, seconds)
 
 
-def _axes(
-    system: HamiltonianSystem, params: Mapping[str, ArrayLike] | None
-) -> tuple[dict[str, float], dict[str, np.ndarray]]:
+def _axes(system: HamiltonianSystem, params: Any) -> tuple[dict[str, float], dict[str, np.ndarray]]:
     """The parameters that are numbers, and those that are axes."""
     if params is None:
         return {}, {}

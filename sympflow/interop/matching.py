@@ -267,10 +267,12 @@ def _drawn(domain: Domain | None, width: int) -> np.ndarray:
     return np.empty((0, width)) if domain is None else domain.sample(N_WITHIN, 20260101)
 
 
-def fixed_step(method: Any, options: dict[str, Any], peer: str) -> FixedStep:
+def fixed_step(method: Any, options: dict[str, Any], peer: str, *systems: Any) -> FixedStep:
     """The fixed-step integrator that `method` and `options` mean; a TypeError where the peer cannot drive it."""
-    from sympflow.integrators.registry import build
+    from sympflow.integrators.registry import build, check_applies
 
+    for what in (type(x).__name__ for x in systems if not isinstance(x, HamiltonianSystem)):
+        raise TypeError(f"`system` must be a HamiltonianSystem; got {what}. See sympflow.interop.systems.")
     integrator = build(method, options)
     if not isinstance(integrator, FixedStep):
         raise TypeError(
@@ -292,6 +294,8 @@ def fixed_step(method: Any, options: dict[str, Any], peer: str) -> FixedStep:
             f"`method` {integrator.name!r} takes steps that are not equal in t, which {peer} cannot drive: use "
             "solve(), or another method."
         )
+    for system in systems:
+        check_applies(integrator, system)
     return integrator
 
 

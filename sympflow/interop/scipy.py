@@ -59,13 +59,7 @@ def as_scipy(method: Any, system: HamiltonianSystem | None = None, **options: An
     >>> solve_ivp(system, (0, 10), system.y0, method=Verlet).y.shape
     (4, 101)
     """
-    if system is not None and not isinstance(system, HamiltonianSystem):
-        raise TypeError(
-            f"`system` must be a HamiltonianSystem; got {type(system).__name__}. See sympflow.interop.systems."
-        )
-    integrator = fixed_step(method, options, "SciPy")
-    if system is not None:
-        check_applies(integrator, system)
+    integrator = fixed_step(method, options, "SciPy", *([] if system is None else [system]))
     return _solver_class(integrator, system)
 
 
@@ -129,7 +123,6 @@ class FlowSolver(OdeSolver, metaclass=_SolverType):
             remedy = f"leave them out; {', '.join(own)} is an option of as_scipy" if own else "leave them out"
             warn(
                 f"The options {', '.join(sorted(extraneous))} have no effect on a fixed-step method: {remedy}.",
-                UserWarning,
             )
         if not as_float(max_step) > 0:
             raise ValueError(f"`max_step` must be positive; got {max_step!r}.")

@@ -352,9 +352,7 @@ def discover(
         return _of_flow(data, terms, degree, most_terms, domain, seed, name)
     trajectories = Trajectories.read(data, ndof, **reading)
     if trajectories.velocities:
-        raise ValueError(
-            '`observed` must be "qp" for `discover`: pass `velocity_mass`, or learn the masses by `learn`.'
-        )
+        raise ValueError('`observed` must be "qp" for `discover`: pass `velocity_mass`, or find the masses by `learn`.')
     trajectories.check_moving()
     period = reading.get("period")
     trajectories.check_angles(None if period is None else np.isinf(periods_of(period, trajectories.ndof)))

@@ -269,9 +269,7 @@ def _formulas(known: Any, d: int) -> tuple[Fixed, ...]:
     return tuple(Fixed(Terms(library, of), np.ones(1)) for of, library in moving)
 
 
-def _identity(
-    data: Trajectories, constraints: Constraints, setting: Setting, options: dict[str, Any]
-) -> dict[str, Any]:
+def _identity(data: Trajectories, constraints: Constraints, setting: Setting, options: Any) -> dict[str, Any]:
     """The description that a search must share with the one that it goes on with."""
     known = [str(part.expression(part.theta, coordinates_of(part.of, data.ndof))) for part in constraints.known]
     of_data = digest([data, constraints.inverse_mass, constraints.periods, setting.noise])

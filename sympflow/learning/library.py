@@ -271,9 +271,7 @@ def _independent(library: Library, states: np.ndarray, named: set[sp.Expr]) -> l
         length = np.linalg.norm(column)
         if not np.isfinite(length):
             if library.expressions[k] in named:
-                raise ValueError(
-                    f"`terms` has {library.expressions[k]}, which is not finite at the data: leave it out."
-                )
+                raise ValueError(f"`terms` has {library.expressions[k]}, not finite at the data: leave it out.")
             continue
         rest = column - basis @ (basis.T @ column)
         rest -= basis @ (basis.T @ rest)

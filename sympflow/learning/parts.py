@@ -194,9 +194,7 @@ class Polynomial(Sum):
 
     def expression(self, theta: np.ndarray, x: Sequence[sympy.Symbol]) -> sympy.Expr:
         terms = zip(self.coefficients(theta), self.exponents.tolist(), strict=True)
-        return sympy.Add(
-            *(sympy.Float(c, 17) * sympy.Mul(*(v**e for v, e in zip(x, m, strict=True))) for c, m in terms if c)
-        )
+        return sympy.Add(*(_float(c) * sympy.Mul(*(v**e for v, e in zip(x, m, strict=True))) for c, m in terms if c))
 
 
 def kinetic(scales: Any) -> Polynomial:
@@ -255,9 +253,7 @@ class Waves(Sum):
         return self.waves.shape[1]
 
     @classmethod
-    def up_to(
-        cls, harmonics: int, degree: int, of: str, scales: Any, periods: np.ndarray, constant: bool = False
-    ) -> Waves:
+    def up_to(cls, harmonics: int, degree: int, of: str, scales: Any, periods: Any, constant: bool = False) -> Waves:
         """Harmonics of the angles to this order, times powers of the others; the constant first if asked for."""
         angles = np.isfinite(periods)
         span = [range(-harmonics, harmonics + 1) if angle else (0,) for angle in angles]

@@ -137,9 +137,7 @@ def _of_pair(t: Any, y: Any) -> Iterator[Found]:
         return
     times = t.reshape(-1, t.shape[-1]) if t.ndim else t
     if t.shape != (*y.shape[:-2], y.shape[-1]):
-        raise ValueError(
-            f"`data` has times of shape {t.shape} and states of shape {y.shape}: give t (n,) for all, or (N, n)."
-        )
+        raise ValueError(f"`data` has times of shape {t.shape} and states of shape {y.shape}: give t (n,), or (N, n).")
     for i, (own, one) in enumerate(zip(times, states, strict=True)):
         yield f"trajectory {i}", own[kept := np.isfinite(own)], one[:, kept]  # ragged trajectories are padded
 
@@ -248,9 +246,7 @@ def _of_file(path: Path) -> Any:
     if ending in (".nc", ".netcdf"):
         with xarray.open_dataset(path) as data:
             return _loaded(data)
-    raise ValueError(
-        f"`data` names a file {ending or 'without an ending'}: .csv, .parquet, .npz, .nc and .zarr are read."
-    )
+    raise ValueError(f"`data` names a file {ending or 'without an ending'}: .csv, .parquet, .npz, .nc, .zarr are read.")
 
 
 def _header(path: Path) -> dict[str, Any]:
@@ -480,9 +476,7 @@ def momenta_of(mass: ArrayLike, v: np.ndarray) -> np.ndarray:
         raise ValueError(f"`velocity_mass` must be a number, ({d},) or ({d}, {d}); got the shape {M.shape}.")
     whole = M if M.ndim == 2 else np.diag(np.broadcast_to(M, d))
     if not (np.isfinite(M).all() and np.allclose(whole, whole.T) and (np.linalg.eigvalsh(whole) > 0).all()):
-        raise ValueError(
-            f"`velocity_mass` must be finite, symmetric and positive definite, by which p = M v; got {mass!r}."
-        )
+        raise ValueError(f"`velocity_mass` must be finite, symmetric and positive definite; got {mass!r}.")
     return M @ v if M.ndim == 2 else (M if M.ndim == 0 else M[:, None]) * v
 
 

@@ -426,9 +426,7 @@ def _gaps(data: Trajectories) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")
-def _ends(
-    model: Field, theta: np.ndarray, method: Method, x: np.ndarray, gaps: np.ndarray, t: np.ndarray
-) -> np.ndarray:
+def _ends(model: Field, theta: np.ndarray, method: Method, x: np.ndarray, gaps: Any, t: Any) -> np.ndarray:
     return model.observed(theta, method.over(model, theta, x.copy(), None, gaps, t)[0], None)[0]
 
 
@@ -482,9 +480,7 @@ def _whole(run: Run) -> Run:
 
 
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")
-def _increments(
-    model: Field, theta: np.ndarray, pieces: Sequence[Run], weights: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _increments(model: Field, theta: np.ndarray, pieces: Sequence[Run], weights: Any) -> tuple[np.ndarray, np.ndarray]:
     """The increments less the integrals of the field, and minus their derivative by θ."""
     here = model.at(np.concatenate([run.t for run in pieces]))
     f = here.field(theta, np.concatenate([run.y for run in pieces], axis=1), False, True)

@@ -6,7 +6,7 @@ Also the states after whole periods, the crossings of a driven system with the p
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -42,12 +42,7 @@ class Crossings(NamedTuple):
 
 
 def crossings(
-    integrator: Integrator,
-    system: HamiltonianSystem,
-    t_span: tuple[float, float],
-    rows: np.ndarray,
-    plane: Plane,
-    sample: float,
+    integrator: Integrator, system: HamiltonianSystem, t_span: Any, rows: np.ndarray, plane: Plane, sample: float
 ) -> Crossings:
     """All crossings of the trajectories from `rows` (N, 2d), two of one within the time `sample` excepted."""
     if isinstance(integrator, FixedStep) and integrator.on_grid:
@@ -90,12 +85,7 @@ def dividing_step(period: float, longest: float) -> float:
 
 
 def _by_events(
-    integrator: Integrator,
-    system: HamiltonianSystem,
-    t_span: tuple[float, float],
-    rows: np.ndarray,
-    plane: Plane,
-    sample: float,
+    integrator: Integrator, system: HamiltonianSystem, t_span: Any, rows: np.ndarray, plane: Plane, sample: float
 ) -> Crossings:
     """The crossings of trajectories that take steps of their own: events of each."""
 

@@ -155,10 +155,8 @@ def _of_table(scheme: Scheme) -> LinearStability:
             points.append(x)
             values.append(value)
         last = points[-1] + 1
-        while (
-            len(p) > 1 and series.polyval(last, p) * Decimal(1).copy_sign(p[-1]) <= 1
-        ):  # from the last extremum on monotone
-            last *= 2
+        while len(p) > 1 and series.polyval(last, p) * Decimal(1).copy_sign(p[-1]) <= 1:
+            last *= 2  # from the last extremum on it is monotone
         points.append(last)
         values.append(series.polyval(last, p))
         windows = _windows(p, points, values)
@@ -288,9 +286,7 @@ class SmallOscillations:
         return float(self.frequencies.max(initial=0.0))
 
 
-def small_oscillations(
-    system: HamiltonianSystem, y0: np.ndarray, orbit: Callable[[], np.ndarray]
-) -> SmallOscillations | None:
+def small_oscillations(system: HamiltonianSystem, y0: np.ndarray, orbit: Callable[[], Any]) -> SmallOscillations | None:
     """The frequencies about a stable equilibrium, else the largest along an orbit; None if there are none."""
     with np.errstate(all="ignore"):
         try:

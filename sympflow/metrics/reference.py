@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -75,9 +76,7 @@ def reference(
     return run(system, t_span, y0, t, target)
 
 
-def _kahan_li(
-    system: HamiltonianSystem, t_span: tuple[float, float], y0: np.ndarray, t: np.ndarray, target: float
-) -> Reference:
+def _kahan_li(system: HamiltonianSystem, t_span: Any, y0: np.ndarray, t: np.ndarray, target: float) -> Reference:
     dt = 4 * system.dt
     previous, best, apart = None, None, math.inf
     for _ in range(_HALVINGS):
@@ -101,17 +100,13 @@ def _kahan_li(
     return best
 
 
-def _dop853(
-    system: HamiltonianSystem, t_span: tuple[float, float], y0: np.ndarray, t: np.ndarray, target: float
-) -> Reference:
+def _dop853(system: HamiltonianSystem, t_span: Any, y0: np.ndarray, t: np.ndarray, target: float) -> Reference:
     smallest = smallest_size(system, y0)
     fine, coarse = (
         solve(system, "dop853", t_span, y0, t_eval=t, rtol=rtol, atol=rtol * smallest).raise_for_status()
         for rtol in (1e-13, 1e-12)
     )
-    return Reference(
-        t, to_numpy(fine.y), "DOP853, rtol = 1e-13", _distance(system, to_numpy(fine.y) - to_numpy(coarse.y))
-    )
+    return Reference(t, y := to_numpy(fine.y), "DOP853, rtol = 1e-13", _distance(system, y - to_numpy(coarse.y)))
 
 
 def _size(system: HamiltonianSystem, y: np.ndarray) -> float:

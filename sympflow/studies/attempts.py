@@ -260,9 +260,7 @@ def counted(x: float | None) -> str:
     return f"{x:,.0f}" if x else ""
 
 
-def columns(
-    rows: Sequence[Any], titles: Sequence[str], own: Mapping[str, Callable[[Any], str]] | None = None
-) -> list[Column]:
+def columns(rows: Sequence[Any], titles: Sequence[str], own: Mapping[str, Any] | None = None) -> list[Column]:
     """Columns of these titles, with cells of `CELLS` or of their own."""
     cells, left = CELLS | dict(own or {}), ("method", "backend", "status")
     return [Column(title, [cells[title](row) for row in rows], title in left) for title in titles]

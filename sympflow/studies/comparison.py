@@ -316,11 +316,7 @@ def tuned(integrator: Integrator, system: HamiltonianSystem, factor: float) -> I
 
 
 def matched(
-    integrator: Integrator,
-    system: HamiltonianSystem,
-    measure: Callable[[Integrator], float],
-    target: float,
-    grows: bool,
+    integrator: Integrator, system: HamiltonianSystem, measure: Callable[[Any], float], target: float, grows: bool
 ) -> tuple[Integrator, float]:
     """Tune an integrator until `measure` is within 5 % of `target`; return the nearest found, and its figure."""
     x, slope = 0.0, (2.0 if grows else -1.0)
@@ -451,10 +447,8 @@ def combined_table(comparisons: Sequence[Comparison], width: int | None = None) 
     several = len(comparisons) > 1
     names = [c.title for c in comparisons for _ in c.rows]
     first = [i == 0 for c in comparisons for i in range(len(c.rows))]
-    columns = [
-        Column("system", [n if f and several else "" for n, f in zip(names, first, strict=True)], left=True),
-        *_columns(rows),
-    ]
+    systems = [n if f and several else "" for n, f in zip(names, first, strict=True)]
+    columns = [Column("system", systems, left=True), *_columns(rows)]
     notes = [
         f"  {f'{name}, ' if several else ''}{row.label}: {row.reason}"
         for name, row in zip(names, rows, strict=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -63,9 +62,7 @@ def comparison_figure(comparison: Compared, kind: str = "overview") -> Figure:
     return figure
 
 
-def save_comparison(
-    comparison: Compared, path: str | os.PathLike[str], kind: str = "overview", prefix: str = ""
-) -> list[Path]:
+def save_comparison(comparison: Compared, path: Any, kind: str = "overview", prefix: str = "") -> list[Path]:
     """Save one figure to a file; into a folder the overview saves every kind that was measured. The files written."""
     path = Path(path)
     if path.suffix.lower() in FIGURE_FILES:

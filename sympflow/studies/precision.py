@@ -145,9 +145,7 @@ def _batch(system: HamiltonianSystem, batch: int | ArrayLike) -> np.ndarray:
     return states
 
 
-def _sweep(
-    candidate: Candidate, by_name: bool, steps: Sequence[float], tolerances: Sequence[float], size: float
-) -> list[Any]:
+def _sweep(candidate: Candidate, by_name: bool, steps: list[float], tolerances: list[float], size: float) -> list[Any]:
     """The candidate's integrator at each of its steps or tolerances, from coarse to fine; `size` is that of states."""
     integrator = candidate.integrator
     if integrator is None or not by_name or integrator.trained:
@@ -198,11 +196,7 @@ class Conditions:
 
 
 def _measure(
-    conditions: Conditions,
-    swept: list[tuple[Candidate, list[Any]]],
-    repeats: int,
-    budget: float,
-    say: Callable[[str], None],
+    conditions: Conditions, swept: Sequence[Any], repeats: int, budget: float, say: Callable[[str], None]
 ) -> tuple[list[Row], Reference | None]:
     """All points for one set of initial states."""
     scene = f"{conditions.system.name}, {conditions.trajectories} trajectories"
@@ -420,9 +414,8 @@ class WorkPrecision(Report):
         """
         from sympflow.studies.figures import precision_figure
 
-        return precision_figure(
-            self.rows, f"{self.title}, T = {self.t_span[1] - self.t_span[0]:g}", measure or self.measure
-        )
+        t0, t1 = self.t_span
+        return precision_figure(self.rows, f"{self.title}, T = {t1 - t0:g}", measure or self.measure)
 
     def plot(self, path: str | os.PathLike[str] | None = None, measure: str | None = None) -> Figure:
         """The figure, as `figure`; with a path it is also saved."""

@@ -105,9 +105,7 @@ def a_step_length_for_each_state(integrator: Integrator, system: HamiltonianSyst
     together = step(y, h)
     assert together.shape == y.shape, f"a step of states {y.shape} has shape {together.shape}"
     for i in range(3):
-        assert_close(
-            together[i], step(y[i], h[i]), 1e3 * EPS, f"state {i} of a batch with its own h differs from alone"
-        )
+        assert_close(together[i], step(y[i], h[i]), 1e3 * EPS, f"state {i} of a batch with its own h differs alone")
         assert_close(together[i], step(y[i], float(h[i])), 1e3 * EPS, "h as a number or an array differs")
 
 
@@ -140,17 +138,15 @@ def the_order_is_the_slope(integrator: Integrator, system: HamiltonianSystem) ->
     assert -0.6 < excess < (0.6 if settled else 1.5), f"declared {integrator.order}, measured {slopes[-1]:.2f}"
 
 
-def _slopes_of_steps(
-    integrator: Integrator, system: HamiltonianSystem, t: float = 0.0, to_an_octave: int = 1
-) -> list[float]:
+def _slopes_of_steps(integrator: Integrator, system: HamiltonianSystem, t: float = 0.0, finer: int = 1) -> list[float]:
     """Slopes between steps h and h/2, so many h to an octave, the last at the shortest whose error is no rounding."""
     y, step = states(system, 12), _step(integrator, system, t)
     errors: list[float] = []
-    for h in (1.6 / 2 ** (k / to_an_octave) for k in range(12 * to_an_octave)):
+    for h in (1.6 / 2 ** (k / finer) for k in range(12 * finer)):
         errors.append(float(np.median(np.abs(step(y, np.full(len(y), h)) - exact(system, h, len(y), t)).max(-1))))
         if errors[-1] < 1e-13:  # as exact as the reference
             break
-    return [float(np.log2(a / b)) - 1 for a, b in zip(errors, errors[to_an_octave:], strict=False) if b > 1e-12]
+    return [float(np.log2(a / b)) - 1 for a, b in zip(errors, errors[finer:], strict=False) if b > 1e-12]
 
 
 def _slopes_of_runs(integrator: Integrator, system: HamiltonianSystem) -> list[float]:
@@ -328,9 +324,7 @@ def both_directions(integrator: Integrator, system: HamiltonianSystem) -> None:
         raise NotApplicable(f"it has no backward time ({error})") from error
     assert back.t[0] == T_END and back.t[-1] == 0.0, f"t runs from {back.t[0]} to {back.t[-1]}"
     missed, allowed = np.abs(back.y[:, -1] - start(system)).max(), np.abs(there - exact(system)).max()
-    assert missed <= 20 * allowed + 1e-10, (
-        f"backward time misses y0 by {missed:.1e}; the method's error is {allowed:.1e}"
-    )
+    assert missed <= 20 * allowed + 1e-10, f"backward time misses y0 by {missed:.1e}; its own error is {allowed:.1e}"
 
 
 def an_empty_interval(integrator: Integrator, system: HamiltonianSystem) -> None:
@@ -448,9 +442,7 @@ def the_run_is_its_steps(integrator: Integrator, system: HamiltonianSystem) -> N
     tolerance = 1e4 * EPS if isinstance(integrator, FixedStep) else max(1e4 * EPS, 0.1 * _rtol(integrator))
     assert_close(stepped[:-1], y[1:], tolerance, "step() does not give the next state of the run, but differs")
     if isinstance(integrator, FixedStep):
-        assert_close(
-            stepped[-1], sol.y[:, -1], 1e4 * EPS, "step() does not give the last state of the run, but differs"
-        )
+        assert_close(stepped[-1], sol.y[:, -1], 1e4 * EPS, "step() does not give the run's last state, but differs")
 
 
 def _rtol(integrator: Integrator) -> float:
@@ -482,12 +474,8 @@ def states_within_a_step_belong_to_it(integrator: Integrator, system: Hamiltonia
     if isinstance(integrator, FixedStep) and integrator.on_grid and bare_step(integrator, system) is None:
         with np.errstate(all="ignore"):
             expected = np.asarray(integrator.step(system, 0.0, y, fractions * h))[within]
-        assert_close(
-            inside, expected, 1e4 * EPS, "a state within a step is not the shorter step from its beginning, but away"
-        )
+        assert_close(inside, expected, 1e4 * EPS, "a state within a step is no shorter step from its start, but away")
         return
-    from sympflow.solver import solve
-
     reference = solve(system, "dop853", (0.0, T_END), start(system), dense_output=True, rtol=1e-12, atol=1e-14).sol
     assert reference is not None
     error = np.abs(inside - reference(times[within]).T).max()
@@ -527,7 +515,7 @@ def _solves(integrator: Integrator, case: tuple[HamiltonianSystem, np.ndarray, f
     assert error < effect / 4, f"the end of {named} is wrong by {error:.1e}, and {moves} by {effect:.1e}: {remedy}"
     if integrator.order is None or bare_step(integrator, system) is not None:
         return
-    slopes = _slopes_of_steps(integrator, system, t0, to_an_octave=2)  # high orders settle just before rounding
+    slopes = _slopes_of_steps(integrator, system, t0, finer=2)  # high orders settle just before rounding
     assert not slopes or slopes[-1] - integrator.order > -0.6, (
         f"with {what} the order is {slopes[-1]:.2f}, and {integrator.order} is declared"
     )
