@@ -17,7 +17,6 @@ from sympflow.arrays import Array, copied, detached, differentiable, stack, to_n
 
 EventFunction = Callable[[float, Array], Any]
 Dense = Callable[[float], Array]  # the state at a time within one step
-
 _EPS = float(np.finfo(float).eps)
 
 
@@ -118,10 +117,7 @@ class EventSearch:
     def step(
         self, t_old: float, y_old: Array, t: float, y: Array, dense: Dense, inner: Sequence[Array] | None = None
     ) -> tuple[float, Array] | None:
-        """Search one step from (t_old, y_old) to (t, y): where the run ends in it, if it does.
-
-        `inner` are the states that divide the step into equal parts, if they are known already.
-        """
+        """Search one step from (t_old, y_old) to (t, y): where the run ends in it, if it does."""
         first = self.values is None
         if first:
             self.values = [event.value(t_old, y_old) for event in self.events]

@@ -53,7 +53,6 @@ __all__ = [
 
 GROUP = "sympflow.schemes"
 """The entry-point group in which a distribution announces its schemes: `name = "package.module:SCHEME"`."""
-
 FORCE_GRADIENT, CURVATURE, POLYNOMIAL = 1, 2, 3  # levels of a scheme, or of a flow: what its kicks have beside V
 
 
@@ -289,9 +288,9 @@ def _drift_first(drifts: tuple[float, ...], kicks: tuple[float, ...]) -> tuple[t
     return (0.0, *kicks), drifts
 
 
-def _palindrome(half: tuple[float, ...], total: float = 1.0) -> tuple[float, ...]:
-    """Coefficients w₁ … w_m, w₀, w_m … w₁ with the middle one making the sum `total`."""
-    return (*half, total - 2.0 * sum(half), *reversed(half))
+def _palindrome(half: tuple[float, ...]) -> tuple[float, ...]:
+    """Coefficients w₁ … w_m, w₀, w_m … w₁ with the middle one making the sum 1."""
+    return (*half, 1.0 - 2.0 * sum(half), *reversed(half))
 
 
 def _even_palindrome(half: tuple[float, ...]) -> tuple[float, ...]:
@@ -343,12 +342,10 @@ _OMELYAN = (
     "I. P. Omelyan, I. M. Mryglod and R. Folk, Construction of high-order force-gradient algorithms for "
     "integration of motion in classical and quantum systems, Phys. Rev. E 66 (2002) 026701"
 )
-
 _NEARLY_INTEGRABLE = (
     "S. Blanes, F. Casas, A. Farrés, J. Laskar, J. Makazaga and A. Murua, New families of symplectic splitting methods "
     "for numerical integration in dynamical astronomy, Appl. Numer. Math. 68 (2013) 58–72"
 )
-
 _YOSHIDA4_WEIGHT = 1.0 / (2.0 - 2.0 ** (1.0 / 3.0))
 _SUZUKI4_WEIGHT = 1.0 / (4.0 - 4.0 ** (1.0 / 3.0))
 _ROOT19 = sqrt(19.0)
@@ -432,19 +429,13 @@ _TABLE = (
 # fmt: on
 
 SCHEMES: dict[str, Scheme] = {scheme.name: scheme for scheme in _TABLE}
-
 _registered: dict[str, Scheme] = {}
 
 
 def scheme_named(name: str) -> Scheme:
     """Return the scheme of that name: of `SCHEMES`, one that was registered, or that of an installed plug-in.
 
-    Raises
-    ------
-    ValueError
-        If there is none.
-    ImportError
-        If the plug-in that announces it cannot be loaded, or announces something else.
+    A ValueError if there is none; an ImportError if the plug-in cannot be loaded, or announces something else.
     """
     if name in SCHEMES:
         return SCHEMES[name]
@@ -477,12 +468,8 @@ def announced_schemes() -> dict[str, EntryPoint]:
 def checked_scheme(scheme: Any) -> Scheme:
     """Return the scheme, if it is one of finite numbers that is consistent where it declares an order.
 
-    Raises
-    ------
-    TypeError
-        If it is no Scheme, or not of numbers.
-    ValueError
-        If a number is not finite, the order is no positive integer, or kicks or drifts do not add up to 1.
+    A TypeError if it is no Scheme, or not of numbers; a ValueError if a number is not finite, the order is no positive
+    integer, or kicks or drifts do not add up to 1.
     """
     if not isinstance(scheme, Scheme):
         raise TypeError(

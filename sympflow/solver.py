@@ -39,10 +39,13 @@ from sympflow.arrays import (
 from sympflow.integrators.base import run_and_search
 from sympflow.integrators.choosing import check_tolerance, choose_method, step_for, with_start, with_step
 from sympflow.integrators.contract import Failure, Integrator, Interrupted, Outcome, Problem
-from sympflow.integrators.diagnosis import diagnose, diagnose_piece, note_poles, note_singularities_of_rows
-from sympflow.integrators.domain_exit import (
+from sympflow.integrators.diagnosis import (
     check_domain,
     check_system_along,
+    diagnose,
+    diagnose_piece,
+    note_poles,
+    note_singularities_of_rows,
 )
 from sympflow.integrators.grid import MOST_OPEN_STEPS, no_event
 from sympflow.integrators.grid_runs import report_lanes
@@ -470,24 +473,16 @@ def _solved_rows(integrator: Integrator, problem: Problem, action: str, rows: Pa
     except Interrupted as stop:
         pieces.append((index, stop.solution))
         whole = max((sol for _, sol in pieces), key=lambda sol: len(sol.t))
-        pieces += [(index, _not_begun(stop.solution, part)) for index, part in groups[len(pieces) :]]
-        pieces = [(index, _up_to(sol, whole.t)) for index, sol in pieces]
+        for index, part in groups[len(pieces) :]:  # not begun
+            y, status = part.y0[..., None][..., :0], np.full(tuple(part.y0.shape[:-1]), -1)
+            own = replace(stop.solution, t=whole.t[:0], y=y, status=status, system=part.system, y0=part.y0)
+            pieces.append((index, own))
+        for i, (index, sol) in enumerate(pieces):  # unknown, NaN, at the last outputs
+            unknown = [full_of_nan(sol.y0)[..., None]] * (len(whole.t) - len(sol.t))
+            pieces[i] = index, replace(sol, t=whole.t, y=concatenate([sol.y, *unknown]), sol=None)
         sol = joined(pieces, problem.system, problem.y0, rows)
         raise Interrupted(stop.outcome, replace(sol, message=stop.solution.message)) from None
     return joined(pieces, problem.system, problem.y0, rows)
-
-
-def _not_begun(sol: Solution, problem: Problem) -> Solution:
-    """The solution of trajectories that were to run after those of `sol`, which Ctrl-C ended."""
-    batch, y0 = tuple(problem.y0.shape[:-1]), problem.y0
-    empty = y0[..., None][..., :0]
-    return replace(sol, t=sol.t[:0], y=empty, status=np.full(batch, -1), system=problem.system, y0=y0, sol=None)
-
-
-def _up_to(sol: Solution, t: np.ndarray) -> Solution:
-    """A solution of which the outputs at the last ones of the times t are unknown, NaN."""
-    unknown = full_of_nan(sol.y0)[..., None]
-    return replace(sol, t=t, y=concatenate([sol.y, *[unknown] * (len(t) - len(sol.t))]), sol=None)
 
 
 def _run(integrator: Integrator, problem: Problem) -> tuple[Outcome, Problem]:

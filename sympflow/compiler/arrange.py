@@ -20,6 +20,7 @@ from sympflow.compiler.program import Program, Recording, Traced
 __all__ = ["Arranged", "Arrangement"]
 
 MOST_TERMS = 64  # of a product that is multiplied out
+MOST_SPREAD = 16  # terms of a sum over which a product of letters is spread: sums of sums would grow with each product
 MOST_TRIED = 10  # terms of a polynomial for which all ways to nest it are compared
 MOST_SEARCHED = 1000  # polynomials, and parts of these, for which they are
 
@@ -212,8 +213,10 @@ class Arrangement:
         return Polynomial(self, terms)
 
     def _product(self, a: Polynomial, b: Polynomial, expand: bool = False) -> Polynomial:
-        if len(a.terms) > 1 and len(b.terms) > 1 and not (expand and len(a.terms) * len(b.terms) <= MOST_TERMS):
-            a, b = self.letter(self.written(a)), self.letter(self.written(b))
+        sums = (len(a.terms) > 1) + (len(b.terms) > 1)
+        most = MOST_TERMS * expand if sums > 1 else MOST_SPREAD
+        if len(a.terms) * len(b.terms) > most and a.constant is None and b.constant is None:
+            a, b = (self.letter(self.written(x)) if len(x.terms) > 1 else x for x in (a, b))
         terms: Terms = {}
         for m, c in a.terms.items():
             for n, d in b.terms.items():

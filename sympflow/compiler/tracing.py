@@ -124,7 +124,7 @@ def _method(name: str) -> Callable[..., Any]:
     return lambda self, *args, **options: self._called(name, args, options)
 
 
-for _name in ("sum", "prod", "mean", "var", "std", "max", "min", "clip", "dot", "any", "all", "cumsum"):
+for _name in ("sum", "prod", "mean", "var", "std", "max", "min", "clip", "dot", "any", "all", "cumsum", "round"):
     setattr(TracedArray, _name, _method(_name))  # NumPy's own do not pass through the protocols
 
 
@@ -245,6 +245,11 @@ def _truncated(x: Any) -> Any:
     return _choose(apply("lt", x, 0.0), -apply("floor", -x), apply("floor", x))
 
 
+def _nearest(x: Any) -> Any:
+    """The nearest whole number; of two as near, a traced number goes to the one above."""
+    return apply("floor", x + 0.5) if isinstance(x, Traced) else float(np.rint(x))
+
+
 def _logaddexp(x: Any, y: Any) -> Any:
     return apply("max", x, y) + apply("log1p", apply("exp", -abs(x - y)))
 
@@ -296,6 +301,8 @@ ELEMENTS: dict[str, Callable[..., Any]] = {
     "cbrt": lambda x: apply("sign", x) * abs(x) ** (1.0 / 3.0),
     "remainder": _of("mod"), "fmod": lambda x, y: x - y * _truncated(x / y),
     "floor_divide": lambda x, y: apply("floor", x / y), "ceil": lambda x: -apply("floor", -x), "trunc": _truncated,
+    "rint": _nearest, "fix": _truncated, "isnan": lambda x: _not(apply("eq", x, x)),
+    "isfinite": lambda x: apply("lt", abs(x), math.inf),
     "deg2rad": lambda x: x * (math.pi / 180), "radians": lambda x: x * (math.pi / 180),
     "rad2deg": lambda x: x * (180 / math.pi), "degrees": lambda x: x * (180 / math.pi),
     "copysign": lambda x, y: abs(x) * _choose(apply("lt", y, 0.0), -1.0, 1.0), "heaviside": _heaviside,
@@ -380,6 +387,20 @@ def _piecewise(x: Any, conditions: Sequence[Any], functions: Sequence[Any], *arg
     return _select(conditions, values, default)
 
 
+def _round(x: Any, decimals: int = 0, out: Any = None) -> Any:
+    unit = 10.0**decimals
+    return _each("rint", unit * _objects(x)) / unit
+
+
+def _sort(x: Any, axis: int = -1, **_: Any) -> np.ndarray:
+    """The values along an axis in order, by comparisons of neighbours."""
+    rows = list(np.moveaxis(_objects(x), axis, 0))
+    for last in range(len(rows) - 1, 0, -1):
+        for k in range(last):
+            rows[k : k + 2] = (_each(name, *rows[k : k + 2]) for name in ("minimum", "maximum"))
+    return np.stack([_objects(row) for row in rows], axis)
+
+
 def _minor(M: np.ndarray, i: int, j: int) -> Any:
     return np.delete(np.delete(M, i, -2), j, -1)
 
@@ -454,7 +475,8 @@ ARRAYS: dict[str, Callable[..., Any]] = {
     "det": _det, "inv": _inv, "solve": _solve, "zeros_like": _like(0.0), "ones_like": _like(1.0),
     "full_like": lambda x, value, **_: np.full(np.shape(x), value).astype(object), "empty_like": _like(0.0),
     "sinc": lambda x: np.frompyfunc(lambda y: _sinc(math.pi * y), 1, 1)(_objects(x)),
-    "real": lambda x: x,
+    "real": lambda x: x, "round": _round, "around": _round, "fix": lambda x: _each("fix", x), "sort": _sort,
+    "ptp": lambda x, *a, **o: _extreme("maximum")(x, *a, **o) - _extreme("minimum")(x, *a, **o),
     "any": _reduced("logical_or"), "all": _reduced("logical_and"), "vecdot": lambda x, y, **_: (x * y).sum(-1),
     "linalg_vecdot": lambda x, y, **_: (x * y).sum(-1), "iscomplexobj": lambda x: False,
 }  # fmt: skip
@@ -520,9 +542,26 @@ def _summed(x: Any, axis: Any = None, keepdims: bool = False, **_: Any) -> Any:
 
 
 def _gelu(x: Any, approximate: str = "none") -> Any:
-    if approximate != "none":
-        raise Untraceable("torch.gelu has no rule where it is approximate")
+    if approximate == "tanh":
+        return 0.5 * x * (1.0 + _each("tanh", math.sqrt(2.0 / math.pi) * (x + 0.044715 * x * x * x)))
     return 0.5 * x * (1.0 + _each("erf", x * (1.0 / math.sqrt(2.0))))
+
+
+def _smooth_ramp(x: Any, beta: float = 1.0, threshold: float = 20.0) -> Any:
+    """torch's softplus without its threshold, beyond which it is x, to 2e-9 at the usual one."""
+    if threshold < 20.0:
+        raise Untraceable("torch.softplus has no rule of a threshold below 20")
+    return np.frompyfunc(_softplus, 1, 1)(_objects(beta * x)) * (1.0 / beta)
+
+
+def _elu(x: Any, alpha: float = 1.0, scale: float = 1.0) -> Any:
+    return _where(_each("less", 0.0, x), x, alpha * _each("expm1", x * (1.0 / scale)))
+
+
+def _dropout(x: Any, p: float = 0.5, training: bool = True, **_: Any) -> Any:
+    if training:
+        raise Untraceable("torch.dropout has no rule while a module is trained: call its eval()")
+    return x
 
 
 def _chunks(x: Any, size: int, axis: int = 0) -> Any:
@@ -536,9 +575,14 @@ TORCH: dict[str, Callable[..., Any]] = {
     "mul": lambda x, y: x * y, "div": lambda x, y: x / y, "pow": lambda x, n: _each("power", x, n),
     "rsub": lambda x, y: y - x, "rpow": lambda x, y: _each("power", y, x), "neg": lambda x: -x,
     "abs": lambda x: _each("absolute", x), "square": lambda x: x * x, "rsqrt": lambda x: 1.0 / _each("sqrt", x),
-    "sigmoid": lambda x: _each("expit", x), "softplus": lambda x, *a: np.frompyfunc(_softplus, 1, 1)(_objects(x)),
+    "sigmoid": lambda x: _each("expit", x), "softplus": _smooth_ramp,
     "silu": lambda x, **_: x * _each("expit", x), "relu": lambda x, **_: _each("maximum", x, 0.0), "gelu": _gelu,
-    "elu": lambda x, alpha=1.0, **_: _where(_each("less", 0.0, x), x, alpha * _each("expm1", x)),
+    "elu": lambda x, alpha=1.0, **_: _elu(x, alpha), "celu": lambda x, alpha=1.0, **_: _elu(x, alpha, alpha),
+    "leaky_relu": lambda x, slope=0.01, **o: _where(_each("less", 0.0, x), x, o.get("negative_slope", slope) * x),
+    "mish": lambda x, **_: x * _each("tanh", _smooth_ramp(x)), "softsign": lambda x: x / (1.0 + _each("absolute", x)),
+    "log_sigmoid": lambda x: _each("log_expit", x), "tanhshrink": lambda x: x - _each("tanh", x),
+    "hardtanh": lambda x, min_val=-1.0, max_val=1.0, **_: _clip(x, min_val, max_val), "dropout": _dropout,
+    "round": _round, "sort": lambda x, *a, **o: _Extremes([_sort(x, *a, **o)]),
     "tril": np.tril, "triu": np.triu, "stack": lambda x, axis=0: np.stack([_objects(y) for y in x], axis),
     "cat": lambda x, axis=0: np.concatenate(x, axis), "concat": lambda x, axis=0: np.concatenate(x, axis),
     "linear": lambda x, w, b=None: x @ np.swapaxes(w, -1, -2) + (0.0 if b is None else b),

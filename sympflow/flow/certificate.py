@@ -18,16 +18,19 @@ QUANTILE, CONFIDENCE = 0.95, 0.99  # of the energy errors, and that its limit is
 
 
 def upper_limit(values: np.ndarray, quantile: float = QUANTILE, confidence: float = CONFIDENCE) -> float:
-    """Return an upper confidence limit of a quantile of |values|, of any distribution: an order statistic [1]_.
+    """Return an upper confidence limit of a quantile of |values|, an order statistic; NaN counts as infinite.
 
-    Of fewer than 90 values it is the largest. What is not finite counts as infinite.
-
-    .. [1] W. J. Conover, Practical Nonparametric Statistics, 3rd ed., 1999, section 3.2.
+    It holds for any distribution (Conover, Practical Nonparametric Statistics, 1999, 3.2).
     """
     from scipy.stats import binom
 
-    ordered = np.sort(np.where(np.isnan(values), math.inf, np.abs(values)))
+    ordered = np.sort(sizes(values))
     return float(ordered[min(int(binom.ppf(confidence, len(ordered), quantile)), len(ordered) - 1)])
+
+
+def sizes(values: np.ndarray) -> np.ndarray:
+    """|values|, and infinity for what is not a number."""
+    return np.where(np.isnan(values), math.inf, np.abs(values))
 
 
 @dataclass(frozen=True)
@@ -41,10 +44,8 @@ class Quantiles:
     @classmethod
     def of(cls, values: np.ndarray) -> Quantiles:
         """Return those of some values; NaN counts as infinite."""
-        values = np.abs(values)
-        values = np.where(np.isnan(values), math.inf, values)
         # never interpolated, which would make NaN of infinities
-        return cls(*(float(np.quantile(values, level, method="higher")) for level in (0.5, 0.95, 1.0)))
+        return cls(*(float(np.quantile(sizes(values), level, method="higher")) for level in (0.5, 0.95, 1.0)))
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from sympflow.compiler import NotCompiled
-from sympflow.flow.certificate import Certificate, Quantiles, upper_limit
+from sympflow.flow.certificate import Certificate, Quantiles, sizes, upper_limit
 from sympflow.flow.weights import doubles
 from sympflow.hamiltonian.domain import Domain
 from sympflow.hamiltonian.system import HamiltonianSystem
@@ -105,13 +105,13 @@ def _over_sample(
 
     def rate(t: np.ndarray, states: np.ndarray) -> np.ndarray:
         at, z = (torch.as_tensor(a, dtype=flow.dtype, device=flow.device) for a in (t, states))
-        return _finite(doubles(gained(at, z)[1]))
+        return sizes(doubles(gained(at, z)[1]))
 
     numbers = x.shape[1] if system.local is None else system.local.numbers
     instants = np.linspace(0.0, flow.dt, times)
     for t in instants.tolist():
         defect, gain = gained(t, points)
-        gains.append(_finite(doubles(gain)))
+        gains.append(sizes(doubles(gain)))
         defects.append(torch.linalg.vector_norm(defect, dim=-1))
         difference = flow.hamiltonian_unchecked(t, points) - H
         mismatches.append(difference - difference.mean())
@@ -119,11 +119,6 @@ def _over_sample(
     rates[:, 2] = _largest_nearby(rate, domain, instants, x, np.array(gains), rng, numbers)
     delta = Quantiles(*(float(np.trapezoid(column, dx=flow.dt / (times - 1))) for column in rates.T))
     return Quantiles.of(doubles(torch.stack(defects))), Quantiles.of(doubles(torch.stack(mismatches))), delta
-
-
-def _finite(values: np.ndarray) -> np.ndarray:
-    """|values|, and infinity for what is not a number."""
-    return np.where(np.isnan(values), math.inf, np.abs(values))
 
 
 def _one_step_error(flow: Any, system: HamiltonianSystem, x: np.ndarray) -> Quantiles:

@@ -14,7 +14,6 @@ import json
 import math
 import os
 import struct
-import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -26,7 +25,7 @@ from safetensors.torch import save as save_tensors
 from torch import Tensor, nn
 
 from sympflow._version import __version__
-from sympflow.arguments import naming_path, put_file, writable
+from sympflow.arguments import naming_path, put_file, warn, writable
 from sympflow.flow import records
 from sympflow.flow.families import family_of
 from sympflow.flow.potentials import Unregistered
@@ -67,11 +66,10 @@ def write(
         if provenance.certified.weights == record["checksum"]:
             record["certificate"] = provenance.certified.to_dict()
         else:
-            warnings.warn(
+            warn(
                 "`flow` was changed, or converted to another precision, after its certificate was computed, which is "
                 "therefore not stored: compute it again by flow.certificate(system) before saving.",
                 RuntimeWarning,
-                stacklevel=3,
             )
     record = _finite(record)
     try:

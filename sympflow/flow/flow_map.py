@@ -319,10 +319,6 @@ class FlowMap(KnownFlow, Shown, nn.Module):
         """Return compiled derivatives of ψ̄_t and d/dt ψ̄_t by the parameters, for Gauss–Newton; None if it has none."""
         return None
 
-    def step_constants(self, x: Tensor, *t0: Tensor) -> Tensor:
-        """The constants of a step from states (N, 2d) that its networks take beside these and t: (m, N)."""
-        return x.new_empty(0, len(x))
-
     # its numbers -------------------------------------------------------------------------------------------
 
     def _number(self) -> Tensor:
@@ -487,12 +483,9 @@ class FlowMap(KnownFlow, Shown, nn.Module):
                 "put them on the last axis."
             )
         if isinstance(t, Tensor) and (t.ndim or differentiable(t)):
-            if t.dtype == torch.bool or t.is_complex():
-                raise TypeError(f"`t` must be real times; got {t.dtype}: use a floating-point tensor.")
             if t.device != x.device:
                 raise ValueError(f"`t` is on {t.device} but `x` on {x.device}: move one of them.")
-            if has_values(t) and not finite_states(t[..., None]).all():
-                raise ValueError("`t` must be finite: remove its NaN and infinite entries.")
+            _check_real("t", t, "remove its NaN and infinite entries")
             try:
                 torch.broadcast_shapes(t.shape, x.shape[:-1])
             except RuntimeError:
@@ -590,15 +583,12 @@ def start_time(t0: Any, x: Tensor, period: float | None) -> Tensor:
         time = time.to(x.device)
     except (TypeError, ValueError, RuntimeError):
         raise TypeError(f"`t0` must be a number or a tensor of times; got {t0!r}: pass seconds.") from None
-    if time.dtype == torch.bool or time.is_complex():
-        raise TypeError(f"`t0` must be real times; got {time.dtype}: use a floating-point tensor.")
     if time.ndim and not _fits(time.shape, x.shape[:-1]):
         raise ValueError(
             f"`t0` of shape {tuple(time.shape)} does not fit the batch shape {tuple(x.shape[:-1])} of `x`: give one "
             "time, or one for each state."
         )
-    if has_values(time) and not finite_states(time.reshape(-1, 1).double()).all():
-        raise ValueError("`t0` must be finite: pass the time of the states.")
+    _check_real("t0", time, "pass the time of the states")
     time = time.double()
     if x.dtype == torch.float64:
         return time
@@ -607,6 +597,14 @@ def start_time(t0: Any, x: Tensor, period: float | None) -> Tensor:
             f"`x` is {x.dtype}, in which times are rounded too much: use float64, or give the system its `period`."
         )
     return time % period
+
+
+def _check_real(name: str, times: Tensor, remedy: str) -> None:
+    """Raise TypeError or ValueError unless times are real and finite."""
+    if times.dtype == torch.bool or times.is_complex():
+        raise TypeError(f"`{name}` must be real times; got {times.dtype}: use a floating-point tensor.")
+    if has_values(times) and not finite_states(times[..., None].double()).all():
+        raise ValueError(f"`{name}` must be finite: {remedy}.")
 
 
 def _fits(shape: torch.Size, batch: torch.Size) -> bool:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, Self
 
 import numpy as np
 
+from sympflow.arguments import warn
 from sympflow.arrays import values
 from sympflow.compiler import NotCompiled
 from sympflow.flow.records import Provenance
@@ -211,12 +211,10 @@ class KnownFlow:
             r = times % self.dt  # a multiple of Δt, up to rounding, is at one end or the other
             inside = (r > low + slack) & (r < high - slack) & (r > slack) & (r < self.dt - slack)
             if inside.any():
-                warnings.warn(
+                warn(
                     f"The flow was fitted to labels, of which none is at a time between {low:g} and {high:g}: what it "
                     "gives there was compared with nothing. Ask for results at multiples of its "  # one text for all t
-                    f"Δt = {self.dt:g}, or train it with labels at more times, or by loss='labels+residual'.",
-                    UserWarning,
-                    stacklevel=3,
+                    f"Δt = {self.dt:g}, or train it with labels at more times, or by loss='labels+residual'."
                 )
                 return
 
@@ -234,12 +232,10 @@ class KnownFlow:
         first = float(start.min() + min(length.min(), 0.0))
         last = float(start.max() + max(length.max(), 0.0))
         if first < low - slack or last > high + slack:
-            warnings.warn(
+            warn(
                 f"The flow was fitted to a drive without a period for t from {low:g} to {high:g}, its system's "
                 "`t_span`, and the run leaves these times: its figures do not hold there. Train it for a system with "
-                "a longer `t_span`, give the system the `period` of its drive, or use a scheme such as 'kahan_li8'.",
-                UserWarning,
-                stacklevel=3,
+                "a longer `t_span`, give the system the `period` of its drive, or use a scheme such as 'kahan_li8'."
             )
 
     def clock_numbers(self) -> tuple[float, ...]:

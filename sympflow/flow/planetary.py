@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -40,13 +40,6 @@ MOST_REACH = 1000
 SAME_ORBITS = 1e-3  # relative differences of periods for which the numbers hold
 AT_DT = 1e-12  # relative difference of a time from Δt that is rounding
 BEFORE, STEPS, AFTER = slice(0, 1), slice(1, 2), slice(2, 3)
-
-
-class _Kept(NamedTuple):
-    """χ and its inverse, of the numbers now."""
-
-    processor: Substeps
-    inverse: Substeps
 
 
 def at_dt(dt: float, t: Any) -> Any:
@@ -117,7 +110,7 @@ class KeplerFlow(SystemFlow):
         self.register_buffer("kicks", torch.zeros(2 * reach, **self._like))
         self.register_buffer("gradients", torch.zeros(n_gradients, **self._like))
         self.periods = None if periods is None else tuple(map(float, periods))
-        self._kept: Kept[_Kept] = Kept([self._buffers])
+        self._kept: Kept[tuple[Substeps, Substeps]] = Kept([self._buffers])
         # A tuple, not a ModuleList: the layers own no numbers.
         self.layers = tuple(PlanetLayer(self, *m) for b, a, _ in BETWEEN for m in ((b, 0.0), (0.0, a)) if any(m))
         self._made_of(system)
@@ -188,10 +181,10 @@ class KeplerFlow(SystemFlow):
     def _moved(self, t: float | Tensor, x: Tensor, parts: slice) -> Tensor:
         """States after some of χ⁻¹, K and χ, or of the scheme before Δt, for t < 0 of its inverse."""
         time = torch.as_tensor(t, dtype=x.dtype, device=x.device).expand(x.shape[:-1])
-        kept, whole = self._kept.current(self._frozen), at_dt(self.dt, to_values(time))
+        (processor, inverse), whole = self._kept.current(self._frozen), at_dt(self.dt, to_values(time))
         passed = time if parts not in (BEFORE, AFTER) else 0 * time
         ends: list[Tensor] = []
-        for is_trained, pieces in ((True, (kept.inverse, STEP, kept.processor)), (False, ([], BETWEEN, []))):
+        for is_trained, pieces in ((True, (inverse, STEP, processor)), (False, ([], BETWEEN, []))):
             if (whole == is_trained).any():
                 timed = [*zip(pieces, (time.abs(), time, time.abs()), strict=True)]
                 ends.append(self.frame.moved(x, passed, *timed[parts]))
@@ -201,9 +194,10 @@ class KeplerFlow(SystemFlow):
 
     # its runs -------------------------------------------------------------------------------------------------
 
-    def _frozen(self) -> _Kept:
+    def _frozen(self) -> tuple[Substeps, Substeps]:
+        """χ and its inverse, of the numbers now."""
         processor = processor_of(*(doubles(x).tolist() for x in (self.kicks, self.gradients)))
-        return _Kept(processor, reversed_substeps(processor))
+        return processor, reversed_substeps(processor)
 
     def kernel_for(self, system: HamiltonianSystem, compensated: bool = False) -> Kernel:
         return self._loops_for(system, compensated)
@@ -211,12 +205,12 @@ class KeplerFlow(SystemFlow):
     def _compiled_for(self, system: HamiltonianSystem, compensated: bool) -> Kernel:
         from sympflow.kernels.kepler import KeplerFlowKernel, KeplerKernel, kepler_loops
 
-        kept, loops = self._kept.current(self._frozen), kepler_loops(self.frame)
-        trained = KeplerKernel(loops, STEP, kept.inverse, kept.processor, compensated)
+        (processor, inverse), loops = self._kept.current(self._frozen), kepler_loops(self.frame)
+        trained = KeplerKernel(loops, STEP, inverse, processor, compensated)
         return KeplerFlowKernel(partial(at_dt, self.dt), trained, KeplerKernel(loops, BETWEEN, compensated=compensated))
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
-        kicks = sum(kick != 0 for kick, *_ in self._kept.current(self._frozen).processor)
+        kicks = sum(kick != 0 for kick, *_ in self._kept.current(self._frozen)[0])
         forces = n_steps + kicks * (1 + n_saved) + sum(kick != 0 for kick, *_ in BETWEEN) * n_extra
         return {"force_evaluations": forces, "hessian_evaluations": 2 * len(self.gradients) * (1 + n_saved)}
 

@@ -30,16 +30,7 @@ from sympflow.flow.flow_map import check_system
 from sympflow.flow.frozen import PrimedKnown
 from sympflow.flow.layers import Drift, Kick
 from sympflow.flow.potentials import Time
-from sympflow.flow.primed_potentials import (
-    CURVATURE,
-    FORCE_GRADIENT,
-    POTENTIAL,
-    PolynomialTerm,
-    PrimedDrift,
-    PrimedPotential,
-    Sum,
-    Term,
-)
+from sympflow.flow.primed_potentials import CURVATURE, FORCE_GRADIENT, POTENTIAL, PrimedDrift, PrimedPotential, Term
 from sympflow.flow.records import MAX_LAYERS
 from sympflow.flow.sympflow import SystemFlow
 from sympflow.flow.tables import Columns, Entry, Kind, PrimedShape, Tables, columns_of
@@ -56,18 +47,9 @@ class PrimedFlow(PrimedKnown, SystemFlow):
 
     A palindromic one has even polynomials b, γ, c, a, and its kernel reads the same backwards, which makes K
     time-reversible: continued to negative t by its formulas, K_{−t} = K_t⁻¹. With a processor ψ̄ is conjugate to it.
-    Without a system the flow has a `scheme`, but no values.
-
-    Attributes
-    ----------
-    kicks, drifts, gradients, curvatures : Coefficients, or None
-        b, a, γ and c of the kernel.
-    polynomials : ModuleList of Coefficients, or None
-        e_m, one column for each monomial.
-    processor_kicks, processor_drifts, processor_gradients, processor_curvatures, processor_polynomials
-        Those of χ, or None.
-    substeps : tuple of Substep
-        The maps in the order in which they are executed: χ⁻¹, K, χ.
+    Without a system the flow has a `scheme`, but no values. `kicks`, `drifts`, `gradients` and `curvatures` are the
+    `Coefficients` b, a, γ and c of the kernel, or None, `polynomials` the e_m, and `processor_kicks`, … those of χ;
+    `substeps` are the maps in the order in which they are executed: χ⁻¹, K, χ.
     """
 
     PLAN = "primed"
@@ -196,12 +178,11 @@ class PrimedFlow(PrimedKnown, SystemFlow):
         substep = self.substeps[i]
         if substep.kind == "drift":
             return PrimedDrift(self.ndof, self._binding, substep.weight)
-        passed = Sum(tuple(s.weight for s in self.substeps[:i] if s.kind == "drift"))
+        passed = [s.weight for s in self.substeps[:i] if s.kind == "drift"]
         terms: list[tuple[Term, Entry]] = [(POTENTIAL, substep.weight)]
-        polynomial = PolynomialTerm(self.monomials, substep.more) if self.monomials else None
-        if polynomial is None:
+        if not self.monomials:
             terms += zip((FORCE_GRADIENT, CURVATURE), substep.more, strict=False)
-        return Kick(PrimedPotential(self.ndof, self._binding, terms, polynomial, passed))
+        return Kick(PrimedPotential(self.ndof, self._binding, terms, self.monomials, substep.more, passed))
 
     # the frozen tables --------------------------------------------------------------------------------------
 

@@ -33,19 +33,6 @@ class Factor(Protocol):
         ...
 
 
-@dataclass(frozen=True)
-class Sum:
-    """A sum of such functions, as the drifts before a kick, by which the time has moved on."""
-
-    factors: tuple[Factor, ...]
-
-    def value(self, t: Time) -> Time:
-        return sum((f.value(t) for f in self.factors), 0 * t)
-
-    def rate(self, t: Time) -> Time:
-        return sum((f.rate(t) for f in self.factors), 0 * t)
-
-
 def _called(f: Callable[..., Array], system: HamiltonianSystem, q: Tensor, t: Tensor | None) -> Tensor:
     """f(q, t), by way of NumPy where the functions of the system take nothing else."""
     if system.definition.takes_tensors:
@@ -125,31 +112,6 @@ def _gradient_and_change(U: Term, system: HamiltonianSystem, x: Tensor, dx: Tens
     return gradient(x), (derivative(partial(U.gradient, system), q, along, h) * v.abs().amax(-1, True)).T
 
 
-class PolynomialTerm:
-    """Σ_m e_m(t) q^m; positions are columns (d, N)."""
-
-    def __init__(self, monomials: Monomials, factors: Sequence[Factor]) -> None:
-        self.monomials, self._factors = monomials, tuple(factors)
-
-    def value(self, coefficients: Tensor, x: Tensor) -> Tensor:
-        return value(self.monomials, coefficients, x.T)
-
-    def gradient(self, coefficients: Tensor, x: Tensor) -> Tensor:
-        return gradient(self.monomials, coefficients, x.T).T
-
-    def at(self, t: Time, x: Tensor) -> Tensor:
-        """e(t): (M,), or (N, M) for times (N,)."""
-        return self._stacked([e.value(t) for e in self._factors], x)
-
-    def rate(self, t: Time, x: Tensor) -> Tensor:
-        """Its time derivative."""
-        return self._stacked([e.rate(t) for e in self._factors], x)
-
-    @staticmethod
-    def _stacked(values: Sequence[Time], x: Tensor) -> Tensor:
-        return torch.stack([torch.as_tensor(v, dtype=x.dtype, device=x.device) for v in values], dim=-1)
-
-
 class PrimedDrift(Drift):
     """The drift of a system over s = t a(t/Δt), with friction its exact flow; driven, it moves the times by s."""
 
@@ -205,38 +167,51 @@ def _each(s: Time) -> Time:
 
 
 class PrimedPotential(Potential):
-    """V(t, x) = Σ_j c_j(t) U_j(x), U_j functions of the system, and a polynomial; driven, x has the times below."""
+    """V(t, x) = Σ_j c_j(t) U_j(x) + Σ_m e_m(t) x^m, U_j functions of the system; driven, x has the times below.
+
+    Before it the time has moved on by those that have `passed`.
+    """
 
     def __init__(
         self,
         ndof: int,
         binding: Binding,
         terms: Sequence[tuple[Term, Factor]],
-        polynomial: PolynomialTerm | None = None,
-        passed: Factor | None = None,
+        monomials: Monomials = (),
+        powers: Sequence[Factor] = (),
+        passed: Sequence[Factor] = (),
     ) -> None:
         super().__init__()
-        self.ndof, self.binding = ndof, binding
-        self._terms, self._polynomial, self._passed = terms, polynomial, passed
+        self.ndof, self.binding, self._terms = ndof, binding, terms
+        self._monomials, self._powers, self._passed = monomials, powers, passed
+
+    def _polynomial(self, t: Time, x: Tensor, rate: bool = False) -> Tensor:
+        """e(t), or its derivative: (M,), or (N, M) for times (N,)."""
+        values = [e.rate(t) if rate else e.value(t) for e in self._powers]
+        return torch.stack([torch.as_tensor(v, dtype=x.dtype, device=x.device) for v in values], dim=-1)
+
+    def _slope(self, coefficients: Tensor, x: Tensor) -> Tensor:
+        """The gradient of the polynomial on columns (d, N)."""
+        return gradient(self._monomials, coefficients, x.T).T
 
     def impulse(self, t: Time, x: Tensor) -> Tensor:
         system = self.binding.system
         q, at = _apart(system, x)
         impulse = sum(c.value(t) * U.gradient(system, q, at).T for U, c in self._terms)
-        if self._polynomial is not None:
-            impulse = impulse + self._polynomial.gradient(self._polynomial.at(t, x), q.T)
+        if self._monomials:
+            impulse = impulse + self._slope(self._polynomial(t, x), q.T)
         return impulse  # type: ignore[return-value]
 
     def impulse_and_rate(self, t: Time, x: Tensor) -> tuple[Tensor, Tensor]:
         system = self.binding.system
         q, at = _apart(system, x)
         rate = sum(c.rate(t) * U.value(system, q, at) for U, c in self._terms)
-        if at is not None and self._passed is not None:
+        if at is not None:
+            moved = sum(s.rate(t) for s in self._passed)
             for U, c in self._terms:
-                _, change = jvp(partial(U.value, system, q), at, torch.ones_like(at))
-                rate = rate + c.value(t) * self._passed.rate(t) * change
-        if self._polynomial is not None:
-            rate = rate + self._polynomial.value(self._polynomial.rate(t, x), q.T)
+                rate = rate + c.value(t) * moved * jvp(partial(U.value, system, q), at, torch.ones_like(at))[1]
+        if self._monomials:
+            rate = rate + value(self._monomials, self._polynomial(t, x, rate=True), q)
         return self.impulse(t, x), rate  # type: ignore[return-value]
 
     def impulse_and_tangent(self, t: Time, x: Tensor, dx: Tensor) -> tuple[Tensor, Tensor]:
@@ -247,8 +222,8 @@ class PrimedPotential(Potential):
             slope, change = _gradient_and_change(U, system, x, dx)
             impulse = impulse + c.value(t) * slope
             tangent = tangent + c.rate(t) * slope + c.value(t) * change
-        if self._polynomial is not None:
-            slope, change = jvp(partial(self._polynomial.gradient, self._polynomial.at(t, x)), q, dq)
+        if self._monomials:
+            slope, change = jvp(partial(self._slope, self._polynomial(t, x)), q, dq)
             impulse = impulse + slope
-            tangent = tangent + self._polynomial.gradient(self._polynomial.rate(t, x), q) + change
+            tangent = tangent + self._slope(self._polynomial(t, x, rate=True), q) + change
         return impulse, tangent

@@ -54,39 +54,18 @@ class Refused(Exception):
 
 @dataclass
 class Provenance:
-    """The facts about a flow beside its map: its system, its domain, its figures, and where these hold.
+    """The facts about a flow beside its map: its system, its domain, its figures, and where these hold."""
 
-    Attributes
-    ----------
-    domain : Domain or None
-        Ω, where it was trained.
-    system_name, fingerprint : str or None, tuple of float or None
-        The system it was trained for.
-    recipe, figures : dict
-        How it was trained, and what it achieved.
-    certified : Certificate or None
-        What `certificate` found, or the file held that the flow was loaded from.
-    identity : Identity or None
-        H of that system, all over Ω; None for a flow without a system, or from a file that was written before.
-    unfitted : tuple of (float, float)
-        Open intervals of t in which it was never compared with anything: those between the times of labels, if these
-        were few and it was fitted to nothing else. Results there come with a warning.
-    drive_times : (float, float) or None
-        The interval of t0 + t that the flow of a drive without a period was fitted in: beyond it there is a warning.
-    lattice_terms : mapping of str to str
-        The terms of a lattice, for messages; {} of another system.
-    """
-
-    domain: Domain | None = None
-    system_name: str | None = None
+    domain: Domain | None = None  # Ω, where it was trained
+    system_name: str | None = None  # of the system it was trained for
     fingerprint: tuple[float, ...] | None = None
-    recipe: dict[str, Any] = field(default_factory=dict)
-    figures: dict[str, Any] = field(default_factory=dict)
-    certified: Certificate | None = None
-    identity: Identity | None = None
-    unfitted: tuple[tuple[float, float], ...] = ()
-    drive_times: tuple[float, float] | None = None
-    lattice_terms: Mapping[str, str] = field(default_factory=dict)
+    recipe: dict[str, Any] = field(default_factory=dict)  # how it was trained
+    figures: dict[str, Any] = field(default_factory=dict)  # and what it achieved
+    certified: Certificate | None = None  # what `certificate` found, or the file held that it was loaded from
+    identity: Identity | None = None  # H of that system, all over Ω; None without a system, or from an early file
+    unfitted: tuple[tuple[float, float], ...] = ()  # open intervals of t in which it was compared with nothing
+    drive_times: tuple[float, float] | None = None  # t0 + t for which a drive without a period was fitted
+    lattice_terms: Mapping[str, str] = field(default_factory=dict)  # of a lattice, for messages
 
     def to_record(self) -> dict[str, Any]:
         """The entries of the record in a file, without those that say nothing; the certificate is not among them."""

@@ -542,8 +542,12 @@ class SympFlow(FlowMap):
     def _kept_kernels(self) -> Kept[Any]:
         """The compiled loops of the numbers that the flow has now."""
         if self._network is None:
-            self._network = Kept(d for m in self.modules() for d in (m._parameters, m._buffers))
+            self._network = Kept(self._kept_tensors())
         return self._network
+
+    def _kept_tensors(self) -> Iterable[Mapping[str, Tensor | None]]:
+        """The tensors that compiled loops are made of, which they are compared with in every run."""
+        return (d for m in self.modules() for d in (m._parameters, m._buffers))
 
     def _loops_for(self, system: HamiltonianSystem) -> Kernel:
         return self._kept_kernels.current(self._compiled)
@@ -564,6 +568,7 @@ class SympFlow(FlowMap):
         return NetworkTangents(self.ndof, [layer.kind == "kick" for layer in self.layers], networks)
 
     def step_constants(self, x: Tensor, *t0: Tensor) -> Tensor:
+        """The constants of a step from states (N, 2d) that its networks take beside these and t: (m, N)."""
         return self._opened(self._columns(0.0, self.lift(x, *t0))[1], 0.0)[0][self.ndof :]
 
     def hamiltonian_unchecked(self, t: float | Tensor, x: Tensor, t0: Any = None) -> Tensor:
@@ -665,6 +670,9 @@ class SystemFlow(SympFlow):
 
     def bound(self, system: HamiltonianSystem) -> Self:
         return self if self._binding.known else self.bind(system)
+
+    def _kept_tensors(self) -> Iterable[Mapping[str, Tensor | None]]:
+        return (self._buffers, *(m._parameters for m in self.modules()))  # the bases of columns are no numbers
 
     def _loops_for(self, system: HamiltonianSystem, compensated: bool = False) -> Kernel:
         flow = self.bound(system)

@@ -43,15 +43,7 @@ class PairsHamiltonian(LocalHamiltonian):
     quadratic_kinetic = True
 
     def __init__(
-        self,
-        potential: str | sp.Expr,
-        masses: Any,
-        dim: Any,
-        box: Any,
-        cutoff: Any,
-        softening: Any,
-        params: Mapping[str, Any] | None,
-        bodies: Mapping[str, Any] | None,
+        self, potential: Any, masses: Any, dim: Any, box: Any, cutoff: Any, softening: Any, params: Any, bodies: Any
     ) -> None:
         self.dim = checked_count("dim", plain(dim), 1, MOST_AXES, "1, 2 or 3, the coordinates of a body")
         self.masses = checked_column("masses", masses)
@@ -186,12 +178,7 @@ class PairsHamiltonian(LocalHamiltonian):
         return SymbolicHamiltonian(T + V, {f"{name}_": value for name, value in self.params.items()})
 
     def written_potential(
-        self,
-        q: Sequence[sp.Expr],
-        softening: sp.Expr,
-        columns: Sequence[Sequence[sp.Expr]],
-        c: Mapping[sp.Symbol, sp.Expr],
-        box: Sequence[sp.Expr] = (),
+        self, q: Sequence[Any], softening: Any, columns: Sequence[Any], c: Mapping[Any, Any], box: Sequence[Any] = ()
     ) -> sp.Expr:
         """V of all pairs, in symbols of positions, ε², columns of bodies, parameters and the sides of the box."""
         terms = []
@@ -296,7 +283,7 @@ class PairsHamiltonian(LocalHamiltonian):
         return self.box is None and not self.softening
 
     @cached_property
-    def poles(self) -> Poles | None:  # type: ignore[override]
+    def poles(self) -> Poles | None:
         return PairsPoles(self) or None
 
     def met(self, y: np.ndarray, together: bool = False) -> Iterator[tuple[Any, Any, np.ndarray, list[Any]]]:

@@ -6,6 +6,7 @@ import inspect
 import sys
 import warnings
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from functools import cached_property, partial
 from typing import Any
 
@@ -43,10 +44,7 @@ CLOSE = 1e-9  # of the largest value
 
 
 class CallableHamiltonian(Definition):
-    """The functions of a system given by V(q) or H(q, p), as a program where they can be traced: `form`.
-
-    Those of a driven system take the time first: a float beside arrays, a tensor of one double beside tensors.
-    """
+    """The functions of a system given by V(q) or H(q, p), as a program where they can be traced: `form`."""
 
     library: str = ""  # "numpy" or "torch", whose arrays the functions take; "" if they fail on both
     untraced: str = ""
@@ -57,14 +55,7 @@ class CallableHamiltonian(Definition):
     _hamiltonian: Any
 
     def __init__(
-        self,
-        ndof: int,
-        potential: Callable[..., Array] | None,
-        hamiltonian: Callable[..., Array] | None,
-        gradient: Callable[..., Any] | None,
-        hessian_vector: Callable[..., Any] | None,
-        check: bool = True,
-        timed: bool = False,
+        self, ndof: int, potential: Any, hamiltonian: Any, gradient: Any, hessian_vector: Any, check: Any, timed: bool
     ) -> None:
         check_flag("check", check)
         if (potential is None) == (hamiltonian is None):
@@ -81,17 +72,11 @@ class CallableHamiltonian(Definition):
         self._functions = functions
         if _is_numba(gradient):
             _check_numba(potential, gradient, hessian_vector, "t, " * timed)
-            self.numba_functions = potential, gradient, hessian_vector
-        of_arrays = [None if f is None else _OverTimes(f) if timed else f for f in self._of_states]
+            self.numba_functions = given = potential, gradient, hessian_vector
+            V, slope, product = (NumbaFunction(given, order) for order in range(3))
+            functions = V, None, slope, None if hessian_vector is None else product
+        of_arrays = [None if f is None else _OverTimes(f) if timed else f for f in functions]
         self._potential, self._hamiltonian, self._gradient, self._hessian_vector = of_arrays
-
-    @property
-    def _of_states(self) -> Sequence[Any]:
-        """V, H, the gradient and the product as functions of arrays of states, the time first."""
-        if self.numba_functions is None:
-            return self._functions
-        V, gradient, product = (NumbaFunction(self.numba_functions, order) for order in range(3))
-        return V, None, gradient, None if self.numba_functions[2] is None else product
 
     def identity_parts(self) -> Any:
         return [self.ndof, self._functions] if self.timed else [self.ndof, *self._functions]
@@ -140,7 +125,7 @@ class CallableHamiltonian(Definition):
         return found
 
     @cached_property
-    def poles(self) -> TracedPoles | None:  # type: ignore[override]
+    def poles(self) -> TracedPoles | None:
         return None if self.form is None else TracedPoles(self.form) or None
 
     @cached_property
@@ -315,6 +300,10 @@ class CallableHamiltonian(Definition):
         return differentiable(slope)
 
     @property
+    def _reason(self) -> tuple[str, bool]:
+        return self.untraced, self.library == "numpy"
+
+    @property
     def _some_time(self) -> tuple[float, ...]:
         return (0.0,) * self.timed
 
@@ -387,7 +376,7 @@ class CallableHamiltonian(Definition):
         _ = self.form  # finds out for which library the function is written
         if self._gradient is not None or self.library == library_name(x) == "numpy":
             return _checked(self._protected(self._own, self._name, t, x), x, self._name, ())
-        return _with_torch(partial(self._own, *t), x, self._name, (), self.untraced)
+        return _with_torch(partial(self._own, *t), x, self._name, (), self._reason)
 
     def gradient(self, x: Array, *t: Any) -> Array:
         if self._gradient is None or self._in_place_of(self._gradient, x) is not None:
@@ -399,7 +388,8 @@ class CallableHamiltonian(Definition):
         if self._exact(x) is not None:
             return self._derived("hessian", _hessian_of, x, (), t)
         if self._hessian_vector is not None:
-            columns = [self._protected(self._hessian_vector, "hessian_vector", t, x, e) for e in _basis(x)]
+            basis = [e + 0 * x for e in like(np.eye(n), x)]
+            columns = [self._protected(self._hessian_vector, "hessian_vector", t, x, e) for e in basis]
             return stack([_checked(column, x, "hessian_vector", (n,)) for column in columns])
         if self._gradient is not None and not is_tensor(x):
             raise ValueError(
@@ -418,7 +408,7 @@ class CallableHamiltonian(Definition):
         form = self._exact(x)
         if form is not None:
             return getattr(form, name)(x, *t)
-        return _with_torch(make(partial(self._own, *t), self._name), x, self._name, tail, self.untraced)
+        return _with_torch(make(partial(self._own, *t), self._name), x, self._name, tail, self._reason)
 
     def _protected(self, function: Callable[..., Any], name: str, times: Sequence[Any], *states: Array) -> Any:
         """The user's function of arrays that it cannot write into, for they are the state of the run."""
@@ -509,16 +499,6 @@ def _check_numba(potential: Any, gradient: Any, hessian_vector: Any, first: str 
             raise TypeError(f"`{name}` must take ({arguments}) as a Numba function; it takes {count} arguments.")
 
 
-def _basis(x: Array) -> list[Array]:
-    """The unit vectors along the last axis, each of the shape of x."""
-    vectors = []
-    for i in range(x.shape[-1]):
-        e = 0 * x
-        e[..., i] = 1
-        vectors.append(e)
-    return vectors
-
-
 def _gradient_of(f: Callable[[Array], Array], name: str) -> Callable[[Array], Array]:
     def gradient(x: Array) -> Array:
         import torch
@@ -532,27 +512,39 @@ def _hessian_of(f: Callable[[Array], Array], name: str) -> Callable[[Array], Arr
     return lambda x: jacobian(_gradient_of(f, name), x)[1]
 
 
-def _with_torch(f: Callable[[Array], Array], x: Array, name: str, tail: tuple[int, ...], untraced: str = "") -> Array:
-    """f(x) for a function written with torch; NumPy arrays go through tensors that share their memory."""
+def _with_torch(
+    f: Callable[[Array], Array], x: Array, name: str, tail: tuple[int, ...], reason: tuple[str, bool]
+) -> Array:
+    """f(x) for a function written with torch; NumPy arrays go through tensors that share their memory.
+
+    `reason` is why it was not traced, and whether it is written for NumPy's arrays.
+    """
     import torch
 
     tensor = x if is_tensor(x) else torch.from_numpy(np.ascontiguousarray(x))
-    version = tensor._version
-    try:
-        value = f(tensor)
-    except (TypeError, RuntimeError, AttributeError, IndexError) as error:
-        if isinstance(error, RecursionError) or str(error).startswith(f"`{name}` must"):
-            raise
+    version, value, failure = tensor._version, None, None
+    untraced, of_numpy = reason
+    with warnings.catch_warnings() if of_numpy else nullcontext():
+        if of_numpy:
+            warnings.simplefilter("error", DeprecationWarning)  # of functions that take tensors for arrays
+        try:
+            value = f(tensor)
+        except (TypeError, RuntimeError, AttributeError, IndexError, DeprecationWarning) as error:
+            if isinstance(error, RecursionError) or str(error).startswith(f"`{name}` must"):
+                raise
+            failure = error
+    if untraced and (isinstance(value, np.ndarray | np.generic) or (failure and of_numpy)):
+        raise TypeError(
+            f"`{name}` could not be traced, for {untraced}, and torch cannot differentiate it. Write it with functions "
+            "that have a rule, or pass `gradient` as well, as spline(q, 1) of a spline of SciPy, or use "
+            "HamiltonianSystem.from_sympy."
+        ) from failure
+    if failure:
         traced = f", and could not be traced, for {untraced}" if untraced else ""
         raise TypeError(
-            f"`{name}` failed on a torch tensor of shape {tuple(x.shape)} ({error}){traced}. Write it with NumPy's or "
-            "torch's functions of (..., d) arrays, or pass `gradient` as well, or use HamiltonianSystem.from_sympy."
-        ) from error
-    if untraced and isinstance(value, np.ndarray | np.generic):
-        raise TypeError(
-            f"`{name}` could not be traced, for {untraced}, and torch cannot differentiate what it returns. Write it "
-            "with functions that have a rule, or pass `gradient` as well, as spline(q, 1) of a spline of SciPy."
-        )
+            f"`{name}` failed on a torch tensor of shape {tuple(x.shape)} ({failure}){traced}. Write it with NumPy's "
+            "or torch's functions of (..., d) arrays, or pass `gradient` as well, or use HamiltonianSystem.from_sympy."
+        ) from failure
     if tensor._version != version:
         raise ValueError(f"`{name}` writes into its argument, the state of the run: let it work on a copy, q.clone().")
     value = _checked(value, tensor, name, tail)

@@ -13,7 +13,7 @@ import numpy as np
 from sympflow.arrays import Array
 
 if TYPE_CHECKING:
-    from sympflow.hamiltonian.poles import Poles
+    pass
 
 
 def bare_copy(x: Any) -> Any:
@@ -49,13 +49,12 @@ class Definition:
     loops: str = ""  # the compiled loops of a definition by one piece: see `sympflow.hamiltonian.local`
     leaps: bool = False  # bodies may meet, over which a step may leap: then there is `leapt`
     impulses: tuple[Any, ...] = ()  # DiracDelta in t: then there are `between_impulses` and `kicks`
-    poles: Poles | None = None  # the places at which H is infinite or no number, which a step may leap over
+    poles: Any = None  # the places at which H is infinite or no number, which a step may leap over
     form: Any = None  # the program of functions that could be traced: see `sympflow.hamiltonian.formulas`
     layered: Any = None  # V with layers whose weights torch follows: see `sympflow.hamiltonian.layered`
     untraced: str = ""  # the reason for which they could not, a clause, known after `form`
     given_functions: bool = False  # of Python, which are traced where that is possible
     instead: str = "an implicit method such as 'gauss_legendre6', or a Runge–Kutta method"
-
     _generated: tuple[str, ...] = ("_functions",)  # what cannot be pickled, and is made again
 
     def __getstate__(self) -> dict[str, Any]:

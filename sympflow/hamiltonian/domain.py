@@ -264,13 +264,7 @@ def remedy_for(system: Hamiltonian) -> str:
 
 
 def domain_from_dict(description: dict[str, Any]) -> Ball | Box | EnergySublevel | LatticeStates | Tube:
-    """The domain that `to_dict` described.
-
-    Raises
-    ------
-    ValueError
-        If the description is not one of a known domain.
-    """
+    """The domain that `to_dict` described; a ValueError if it is not one of a known kind."""
     kinds: dict[str, Any] = {kind.__name__: kind for kind in (Ball, Box, EnergySublevel, LatticeStates, Tube)}
     try:
         fields = {k: v for k, v in description.items() if k not in ("kind", "box")}

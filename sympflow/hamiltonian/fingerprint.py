@@ -142,7 +142,6 @@ class Identity:
             i = int(finite[0]) if finite.size else 0
             return float(_energies(system, self.states[: i + 1])[i]), float(self.energies[i])
         read, state = _read(self.expression, system.ndof), _fixed_states(system.ndof)[:1]
-        assert read is not None
         return float(_energies(system, state)[0]), float(_energies(read, state)[0])
 
     def is_proved(self, system: Hamiltonian) -> bool:
@@ -203,21 +202,16 @@ def _floats(values: Any, ndim: int) -> np.ndarray:
         raise ValueError("its numbers are no array of floats") from None
 
 
-def _probed_times(system: Hamiltonian, n: int) -> np.ndarray:
-    """The times (n,) of states, within the samples of a function of t if there are some."""
-    span = None if system.symbols is None else system.symbols.span
-    low, high = (0.0, LATEST) if span is None else span
-    return low + (high - low) * (np.arange(1, n + 1) * GOLDEN % 1.0)
-
-
 def _energies(system: Hamiltonian, states: np.ndarray) -> np.ndarray:
-    """H at the states (n, 2d), of a driven system each at a time that its number gives."""
+    """H at the states (n, 2d), of a driven system each at a time that its number gives, within samples."""
+    low, high = (system.symbols and system.symbols.span) or (0.0, LATEST)
+    times = low + (high - low) * (np.arange(1, len(states) + 1) * GOLDEN % 1.0)
     with np.errstate(all="ignore"):
-        return to_numpy(system.hamiltonian(states, _probed_times(system, len(states)))).astype(float)
+        return to_numpy(system.hamiltonian(states, times)).astype(float)
 
 
 @lru_cache(maxsize=16)
-def _read(expression: str | None, ndof: int) -> Hamiltonian | None:
+def _read(expression: str | None, ndof: int) -> Any:
     """The H of a text in a file, read by a grammar and never executed; None if it is none of d degrees of freedom."""
     from sympflow.hamiltonian.hamiltonian import Hamiltonian
     from sympflow.hamiltonian.symbolic import SymbolicHamiltonian

@@ -23,16 +23,6 @@ from sympflow.compiler.program import CONDITIONS, Program, Recording, Traced, gr
 if TYPE_CHECKING:
     from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 
-__all__ = [
-    "Formula",
-    "TracedDriving",
-    "TracedHamiltonian",
-    "TracedLetters",
-    "TracedPoles",
-    "Variable",
-    "evaluator",
-    "recorded",
-]
 
 MOST_IN_SYMBOLS = 300  # operations
 _JUMPING = {"sign", "floor", "mod", "where", "lt", "le", "eq", "atan2"}
@@ -107,10 +97,7 @@ class Entries:
 
 
 class TracedHamiltonian:
-    """The form of a system of Python functions, as `SymbolicHamiltonian` is that of a system of symbols.
-
-    The program is V of q, if it is `separable`, or H of q and p; of a driven system the time comes first.
-    """
+    """The form of a system of Python functions, as `SymbolicHamiltonian` is that of a system of symbols."""
 
     parameters: tuple[Variable, ...] = ()
     values: tuple[float, ...] = ()
@@ -124,8 +111,8 @@ class TracedHamiltonian:
         self.p = tuple(Variable(f"p{i + 1}") for i in range(ndof))
         self.time = Variable("t") if timed else None
         times = (self.time,) if self.time else ()
-        self.V: Formula | None = None
-        self.T: Formula | None = None
+        self.V: Any = None
+        self.T: Any = None
         self.inverse_mass: Entries | None = None
         if not separable:
             self.H = Formula(program, (*times, *self.q, *self.p))
@@ -138,7 +125,6 @@ class TracedHamiltonian:
 
     def _set_potential(self, V: Formula) -> None:
         T, n = self.T, len(V.variables)
-        assert T is not None
         variables = (*V.variables, *self.p)
         H = traced(lambda *x: [V.program(*x[:n])[0] + T.program(*x[n:])[0]], *(s.name for s in variables))
         self.V, self.H = V, Formula(H, variables)
@@ -188,7 +174,6 @@ class TracedHamiltonian:
     @cached_property
     def driving(self) -> TracedDriving:
         """The form with coefficients for what depends on the time alone."""
-        assert self.V is not None
         (V,), coefficients = without_time([self.V], self.time)
         form = copy.copy(self)
         form.time, form.parameters = None, tuple(coefficients)
@@ -306,8 +291,11 @@ class TracedPoles:
             elif _least(g) < POSITIVE:
                 self._vanishing[g.order] = g
                 used = [x for x in self._form.H.program.inputs if x.order in _reached(g)]
-                if len(used) == 1 and g is not used[0] and _at_zero(g, used[0]) == 0.0:
-                    self._add(used[0])  # which it may touch
+                if len(used) == 1 and g is not used[0]:
+                    with np.errstate(all="ignore"):
+                        at_zero = Program(used, [g])(np.float64(0.0))[0]
+                    if at_zero == 0.0:  # which it may touch
+                        self._add(used[0])
 
     def may_pass(self, y: np.ndarray) -> bool:
         """Return True: signs and H are looked at in all runs."""
@@ -333,17 +321,12 @@ def _between_roots(g: Traced) -> tuple[Any, Any] | None:
     """The x − a and x + a of x² − a²."""
     if g.name != "sub" or not isinstance(g.args[1], float) or g.args[1] <= 0:
         return None
-    x, a = _squared(g.args[0]), math.sqrt(g.args[1])
-    return None if x is None else (x - a, x + a)
-
-
-def _squared(x: Any) -> Traced | None:
-    """The x of x²."""
-    if not (isinstance(x, Traced) and x.name in ("pow", "mul")):
+    square, a = g.args[0], math.sqrt(g.args[1])
+    if not (isinstance(square, Traced) and square.name in ("pow", "mul")):
         return None
-    base, other = x.args
-    square = other is base if x.name == "mul" else isinstance(other, float) and other == 2
-    return base if square else None
+    x, other = square.args
+    is_square = other is x if square.name == "mul" else isinstance(other, float) and other == 2
+    return (x - a, x + a) if is_square else None
 
 
 def _reached(g: Traced) -> set[int]:
@@ -355,11 +338,6 @@ def _reached(g: Traced) -> set[int]:
             found.add(x.order)
             left += [a for a in x.args if isinstance(a, Traced)]
     return found
-
-
-def _at_zero(g: Traced, x: Traced) -> float:
-    with np.errstate(all="ignore"):
-        return float(Program([x], [g])(np.float64(0.0))[0])
 
 
 _TOUCHING = {"cos": (math.pi, 0.0), "sin": (math.pi / 2, -math.pi / 2), "cosh": (0.0, 0.0)}

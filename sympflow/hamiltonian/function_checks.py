@@ -28,10 +28,7 @@ REMEDY = "where all is as it should be, pass check=False to HamiltonianSystem."
 
 
 def probe_states(given: np.ndarray | None, domain: Domain | None, width: int) -> np.ndarray:
-    """States (n, width) at which functions are tested: the given ones, near these, and some of the domain.
-
-    Without any they are random numbers of size 1.
-    """
+    """States (n, width) at which functions are tested: the given ones, near these, and some of the domain."""
     rng = np.random.Generator(np.random.PCG64(20260102))
     found = []
     if given is not None:
@@ -49,10 +46,7 @@ def probe_states(given: np.ndarray | None, domain: Domain | None, width: int) ->
 
 
 def reach(states: np.ndarray, parts: int) -> np.ndarray:
-    """The least and the largest components (2, width) that a run may have without another test, by states tested.
-
-    They are `parts` halves of sizes of their own: q, or q and p.
-    """
+    """The least and the largest components (2, width) that a run may have without another test, by states tested."""
     low, high = states.min(0), states.max(0)
     with np.errstate(over="ignore"):
         lengths = (high - low).reshape(parts, -1)
@@ -83,8 +77,8 @@ class Tested:
 
     names: tuple[str, str, str]  # of the functions, and of the state, in messages
     value: Callable[[Array], Array]
-    gradient: Callable[[Array], Array] | None  # None of an exact one, of a function that was traced
-    hessian_vector: Callable[[Array, Array], Array] | None = None
+    gradient: Any  # None of an exact one, of a function that was traced
+    hessian_vector: Any = None
     automatic: bool = False  # the gradient is an automatic one
     parts: int = 1  # 2 if x is [q, p], two halves of sizes of their own
     result_types: Callable[[Array], list[tuple[str, Any]]] | None = None  # in which the user's own functions answer
@@ -99,8 +93,7 @@ def test(functions: Tested, states: np.ndarray, example: Array, n_given: int) ->
             return
         x, V, g = kept
         _check_types(functions, x)
-        _check_repetition(functions, x, V, g)
-        _check_batches(functions, x, V, g)
+        _check_values(functions, x, V, g)
         if functions.gradient is not None:
             _check_gradient(functions, x, V, g)
         if functions.hessian_vector is not None:
@@ -147,28 +140,21 @@ def _check_types(functions: Tested, x: Array) -> None:
             )
 
 
-def _given(functions: Tested, V: np.ndarray, g: np.ndarray) -> list[tuple[str, Callable[[Array], Array], np.ndarray]]:
-    """The names of the value and of the gradient, where it is one to be tested, and their values at single states."""
-    rows = zip(functions.names, (functions.value, functions.gradient), (V, g), strict=False)
-    return [(name, function, values) for name, function, values in rows if function is not None]
-
-
-def _check_repetition(functions: Tested, x: Array, V: np.ndarray, g: np.ndarray) -> None:
-    for name, function, (before, *_) in _given(functions, V, g):
-        again = _numbers(function(x[0]))
+def _check_values(functions: Tested, x: Array, V: np.ndarray, g: np.ndarray) -> None:
+    """Compare the value and the gradient, where it is one to be tested, with themselves, again and in a batch."""
+    n = x.shape[-1]
+    rows = np.arange(n if 2 <= n <= EVERY_COMPONENT else 3) % len(x)  # of a square one a transposed result would fit
+    given = [*zip(functions.names, (functions.value, functions.gradient), (V, g), strict=False)]
+    for name, function, (before, *_) in given:
+        again = before if function is None else _numbers(function(x[0]))
         if not np.allclose(again, before, rtol=1e-6, atol=1e-12 * np.abs(before).max(), equal_nan=True):
             raise ValueError(
                 f"`{name}` gives another value each time: at {_shown(functions, x[0])} {_short(before)}, then "
                 f"{_short(again)}. A Hamiltonian is a function of the state alone; {REMEDY}"
             )
-
-
-def _check_batches(functions: Tested, x: Array, V: np.ndarray, g: np.ndarray) -> None:
-    """In a square batch, d states of d components, a transposed result has the right shape."""
-    n = x.shape[-1]
-    rows = np.arange(n if 2 <= n <= EVERY_COMPONENT else 3) % len(x)
-    for name, function, single in _given(functions, V, g):
-        _check_batch(functions, name, x[rows], single[rows], _numbers(function(x[rows])))
+    for name, function, single in given:
+        if function is not None:
+            _check_batch(functions, name, x[rows], single[rows], _numbers(function(x[rows])))
 
 
 def _check_batch(functions: Tested, name: str, x: Array, single: np.ndarray, batch: np.ndarray) -> None:
@@ -192,10 +178,7 @@ def _check_batch(functions: Tested, name: str, x: Array, single: np.ndarray, bat
 
 
 def _directions(x: np.ndarray, chosen: Sequence[int] | None, parts: int, own: bool = False) -> np.ndarray:
-    """Directions (N, m, n) at states (N, n), of the size of these: those of chosen components, or random ones.
-
-    A small component is moved by a tenth of the largest, or, if it is not 0, by its `own` size.
-    """
+    """Directions (N, m, n) at states (N, n), of the size of these: those of chosen components, or random ones."""
     groups = np.abs(x).reshape(len(x), parts, -1)
     largest = groups.max(-1, keepdims=True)
     size = np.maximum(groups, 0.1 * np.where(largest > 0, largest, 1.0))
@@ -310,8 +293,6 @@ def _refuse(functions: Tested, state: Array, k: int, given: float, found: float,
 
 
 def _check_hessian_vector(functions: Tested, x: Array, g: np.ndarray) -> None:
-    assert functions.hessian_vector is not None
-    assert functions.gradient is not None
     name = "hessian_vector"
     v, claimed = _products(functions, x, own=False)
     if claimed.shape != g.shape:
@@ -336,7 +317,6 @@ def _check_hessian_vector(functions: Tested, x: Array, g: np.ndarray) -> None:
 
 def _products(functions: Tested, x: Array, own: bool) -> tuple[np.ndarray, np.ndarray]:
     """One random direction at each state, and the given products of the Hessian with them, (N, n) each."""
-    assert functions.hessian_vector is not None
     v = _directions(_numbers(x), None, 1, own)[:, 0]
     vectors = like(v, x)
     return v, np.stack([_numbers(functions.hessian_vector(x[i], vectors[i])) for i in range(len(x))])

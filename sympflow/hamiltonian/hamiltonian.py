@@ -67,7 +67,7 @@ class Hamiltonian:
     def __init__(self, name: str, definition: Any, inverse_mass: np.ndarray | None, quadratic_kinetic: bool) -> None:
         self.name = name
         self.definition = definition
-        self.symbols: SymbolicHamiltonian | None = definition.symbols
+        self.symbols: Any = definition.symbols
         self.ndof: int = definition.ndof
         self.separable: bool = definition.separable
         self.inverse_mass = inverse_mass
@@ -76,17 +76,12 @@ class Hamiltonian:
         self.quadratic_kinetic = quadratic_kinetic
         self.stiffness_matrix: np.ndarray | None = None
         self.functions_given: bool = definition.given
+        self.numba_functions: Any = definition.numba_functions
         self.autonomous = not definition.timed
         self._tested: dict[tuple[type, Any], np.ndarray] = {}  # how far, by the kind of states
 
     def hamiltonian(self, y: Array, t: Any = None) -> Array:
-        """H(y), or H(t, y): (..., 2d) to (...).
-
-        Raises
-        ------
-        TypeError
-            As every function of a driven system, if t is left out.
-        """
+        """H(y), or H(t, y): (..., 2d) to (...); a TypeError, as of all functions, where t is missing."""
         self._check_width(y)
         if self.separable:
             q, p = y[..., : self.ndof], y[..., self.ndof :]
@@ -111,13 +106,7 @@ class Hamiltonian:
         return concatenate([concatenate([A, 0 * A]), concatenate([0 * B, B])], -2)
 
     def momenta(self, q: Array, v: Array, t: Any = None) -> Array:
-        """p with ∂H/∂p(q, p) = v, by Newton's method from p = v: (..., d) and (..., d) to (..., d).
-
-        Raises
-        ------
-        ValueError
-            If no p is found: M of H = ½ pᵀM⁻¹p + V always gives one.
-        """
+        """p with ∂H/∂p(q, p) = v, (..., d) each, by Newton's method from p = v; a ValueError where none is found."""
         d, p = self.ndof, v
         for _ in range(NEWTON):
             y = concatenate([q, p])
@@ -139,12 +128,8 @@ class Hamiltonian:
     def energy_density(self, y: Array, t: Any = None) -> Array:
         """H at each site of a lattice (..., *shape), or each body of pairs (..., n), which add up to H.
 
-        The energy of a bond or a pair is divided evenly between its ends; that of a bond to a wall is its site's.
-
-        Raises
-        ------
-        ValueError
-            For other systems.
+        The energy of a bond or a pair is divided evenly between its ends; that of a bond to a wall is its site's. A
+        ValueError for other systems.
         """
         self._check_width(y)
         if self.local is None:
@@ -189,26 +174,14 @@ class Hamiltonian:
         return forced
 
     def as_doubled(self) -> Any:
-        """Return the system itself if it is a doubled one.
-
-        Raises
-        ------
-        ValueError
-            If it is none.
-        """
+        """Return the system itself if it is a doubled one; a ValueError if it is none."""
         raise ValueError(
             f"`system` {self.name!r} is not doubled: its states are the physical ones: make one "
             "by sympflow.doubled(system, force), or leave out what asks for its physical limit."
         )
 
     def lift(self, y: Array) -> Array:
-        """The states (..., 2d) for `y` of another width; only doubled systems have such.
-
-        Raises
-        ------
-        ValueError
-            For any other system.
-        """
+        """The states (..., 2d) for `y` of another width; a ValueError but for doubled systems, which have such."""
         raise ValueError(
             f"`y0` must have shape (..., {2 * self.ndof}) for {self.name!r}, [q, p] with {self.ndof} each; got "
             f"{tuple(y.shape)}. Join q and p along the last axis, np.concatenate([q, p], axis=-1)."
@@ -246,14 +219,9 @@ class Hamiltonian:
         return self.keeps_energy
 
     def check_conservative(self, what: str, remedy: str) -> None:
-        """Refuse a system with friction, for what leaves it out or does not hold with it.
+        """Refuse a system with friction, by a ValueError with `what` leaves it out, a clause, and the remedy.
 
         With an external force the remedy is always the same: the vector field, or the doubled system.
-
-        Raises
-        ------
-        ValueError
-            With the reason, `what` is asked as a clause, and the remedy.
         """
         if self.external_force is not None:
             raise ValueError(
@@ -265,13 +233,7 @@ class Hamiltonian:
             raise ValueError(f"`system` {self.name!r} has friction, p' = −∂H/∂q − Γp, {what}: {remedy}.")
 
     def check_autonomous(self, what: str, remedy: str) -> None:
-        """Refuse a driven system, H(t, q, p), for what leaves the time out or does not hold with it.
-
-        Raises
-        ------
-        ValueError
-            With the reason, `what` is asked as a clause, and the remedy.
-        """
+        """Refuse a driven system, H(t, q, p), by a ValueError with `what` leaves the time out and the remedy."""
         if not self.autonomous:
             raise ValueError(f"`system` {self.name!r} is driven, H depends on t, {what}: {remedy}.")
 
@@ -303,24 +265,12 @@ class Hamiltonian:
         return between
 
     def check_impulses(self, what: str, remedy: str) -> None:
-        """Refuse a system with impulses, DiracDelta in t, for what leaves them out.
-
-        Raises
-        ------
-        ValueError
-            With the reason, `what` is asked as a clause, and the remedy.
-        """
+        """Refuse a system with impulses, DiracDelta in t, by a ValueError with `what` omits them and the remedy."""
         if self.between_impulses is not self:
             raise ValueError(f"`system` {self.name!r} has impulses, DiracDelta in H, {what}: {remedy}.")
 
     def check_times(self, t0: float, t1: float) -> None:
-        """Refuse an interval that leaves the times of sampled parameters.
-
-        Raises
-        ------
-        ValueError
-            With the times of the samples.
-        """
+        """Refuse an interval that leaves the times of sampled parameters, by a ValueError with these."""
         if self.symbols is not None and self.symbols.samples:
             self.symbols.check_times(t0, t1)
 
@@ -378,13 +328,7 @@ class Hamiltonian:
         return self._separable().definition.hessian_vector(self._positions(q), v, *self._time(t, q))
 
     def curvature(self, q: Array, t: Any = None) -> Array:
-        """½ v·∇²V(q) v, the curvature of V along the acceleration v = M⁻¹∇V(q): (..., d) to (...).
-
-        Raises
-        ------
-        ValueError
-            If T is not ½ pᵀM⁻¹p.
-        """
+        """½ v·∇²V(q) v along the acceleration v = M⁻¹∇V(q): (..., d) to (...); a ValueError if T is not ½ pᵀM⁻¹p."""
         symbols = self._with_acceleration().symbols
         if symbols is not None:
             return symbols.curvature(self._positions(q), *self._time(t, q))
@@ -459,22 +403,10 @@ class Hamiltonian:
         return like(np.diag(M) if M.ndim == 1 else M, p)
 
     def drift(self, p: Array, t: Any, s: Any) -> Array:
-        """∫_t^{t+s} ∇T(p, u) du, by which a drift moves q; s·∇T(p) if T does not depend on t.
+        """∫_t^{t+s} ∇T(p, u) du, by which a drift moves q; s·∇T(p) if T does not depend on t: (..., d) to (..., d).
 
-        Parameters
-        ----------
-        p : (..., d)
-        t, s : number or (...)
-            The time at the beginning of the drift and how long it lasts, with its sign.
-
-        Returns
-        -------
-        (..., d)
-
-        Raises
-        ------
-        ValueError
-            If T depends on t and the integral is not elementary.
+        t and s, numbers or (...), are its beginning and how long it lasts, with its sign. A ValueError if T depends on
+        t and the integral is not elementary.
         """
         if not self.kinetic_timed:
             return per_state(s, p) * self.velocity(p)
@@ -538,10 +470,7 @@ class Hamiltonian:
     def program(self) -> Program:
         """H as the operations that are compiled, of t where it is driven, q1 … qd and p1 … pd: print it.
 
-        Raises
-        ------
-        ValueError
-            If there are none: of a lattice or pairs, and of functions that could not be traced, with the reason.
+        A ValueError if there are none: of a lattice or pairs, and of functions that could not be traced, with a reason.
         """
         form = self.form
         if form is None:
@@ -551,7 +480,7 @@ class Hamiltonian:
         return recorded([form.H], (*times, *form.q, *form.p))
 
     @property
-    def written(self) -> SymbolicHamiltonian | None:
+    def written(self) -> Any:
         """The symbolic definition, or that of a few bodies or a traced function, written when asked for; else None."""
         if self.local is not None:
             return self.local.written
@@ -577,11 +506,6 @@ class Hamiltonian:
     def has_hessian_vector(self) -> bool:
         """False if ∇²V·v of arrays is not to be had, as for a gradient that was given without it."""
         return self.definition.has_hessian_vector
-
-    @property
-    def numba_functions(self) -> tuple[Any, Any, Any] | None:
-        """(potential, gradient, hessian_vector) if the system was given by Numba functions, else None."""
-        return self.definition.numba_functions
 
 
 def third_derivative(system: Hamiltonian, q: Array, v: Array, w: Array, t: Any = None) -> Array:

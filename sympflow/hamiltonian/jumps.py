@@ -320,13 +320,12 @@ class Zeros:
         return float(-self.g.subs(self.time, 0) / slope) if slope != 0 else math.nan
 
     @cached_property
-    def _period(self) -> float | None:
+    def _period(self) -> Any:
         return common_period(self.g, self.time)
 
     @cached_property
     def _once(self) -> np.ndarray:
         """The zeros in a period, which begins where zeros are rare."""
-        assert self._period is not None
         return self._sign_changes(self._period * (np.arange(POINTS_A_PERIOD + 1) + 0.1234567) / POINTS_A_PERIOD)
 
     @cached_property
@@ -524,9 +523,9 @@ def _leaves(f: sp.Basic, time: sp.Symbol, samples: Mapping[str, Samples]) -> Ite
         yield from _leaves(each, time, samples)
 
 
-def common_period(f: sp.Expr, time: sp.Symbol, samples: Mapping[str, Samples] | None = None) -> float | None:
+def common_period(f: sp.Expr, time: sp.Symbol) -> float | None:
     """A period of f in t, that of all periodic functions in it, if t is in such alone and they have one."""
-    periods = sorted(set(_leaves(f, time, samples or {})))
+    periods = sorted(set(_leaves(f, time, {})))
     if not periods or math.inf in periods or -math.inf in periods:
         return None
     multiple = 1

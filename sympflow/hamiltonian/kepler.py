@@ -27,7 +27,6 @@ SHORT = 0.25  # βX² up to which a series of so many terms is exact to rounding
 TERMS = 7
 CLOSE = 1e-8  # of X: a step of Newton's or Laguerre's method after which the next one is below rounding
 MOST = 200  # steps of the solver, of which bisection takes a part where nothing else helps
-
 Numbers = list[Any]
 
 
@@ -180,11 +179,7 @@ def next_two(X: Any, beta: Any, G2: Any, G3: Any) -> tuple[Any, Any]:
 
 
 def kepler_flow(x: Sequence[Any], v: Sequence[Any], mu: Any, t: Any) -> tuple[Numbers, Numbers]:
-    """Move x and v, three numbers each, over a time t of any sign, about a centre with μ = GM > 0.
-
-    Ellipses, parabolas and hyperbolas of any eccentricity, as exactly as their conditioning allows; whole periods are
-    left out first.
-    """
+    """Move x and v, three numbers each, over a time t of any sign, about a centre with μ = GM > 0."""
     new = [a + b for a, b in zip([*x, *v], kepler_changes(x, v, mu, t), strict=True)]
     return new[:3], new[3:]
 

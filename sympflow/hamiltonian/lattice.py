@@ -40,14 +40,7 @@ class LatticeHamiltonian(LocalHamiltonian):
     loops = noun = "lattice"
 
     def __init__(
-        self,
-        onsite: str | sp.Expr | None,
-        bond: str | sp.Expr | Mapping[int, str | sp.Expr] | None,
-        shape: Any,
-        boundary: Any,
-        kinetic: str | sp.Expr | None,
-        fields: Any,
-        params: Mapping[str, Any] | None,
+        self, onsite: Any, bond: Any, shape: Any, boundary: Any, kinetic: Any, fields: Any, params: Any
     ) -> None:
         self.shape = checked_shape(shape)
         self.boundary = _checked_boundary(boundary, len(self.shape))
@@ -147,10 +140,7 @@ class LatticeHamiltonian(LocalHamiltonian):
         }
 
     def wells(self) -> list[np.ndarray]:
-        """The values of the fields (F,) at which all sites are at rest: the lowest minima of U, 0 without U.
-
-        U is first looked at along straight lines, at fields of all sizes, for the units in which it is minimized.
-        """
+        """The values of the fields (F,) at which all sites are at rest: the lowest minima of U, 0 without U."""
         n, rng = len(self.fields), np.random.default_rng(0)
         if self.U == 0:
             return [np.zeros(n)]
@@ -188,7 +178,7 @@ class LatticeHamiltonian(LocalHamiltonian):
         return [size * x for x in kept]
 
     @cached_property
-    def poles(self) -> Poles | None:  # type: ignore[override]
+    def poles(self) -> Poles | None:
         return LatticePoles(self) or None
 
     def remark(self, q: np.ndarray) -> str:

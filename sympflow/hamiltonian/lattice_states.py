@@ -81,13 +81,7 @@ class LatticeStates:
 
     @classmethod
     def of_states(cls, system: Hamiltonian, states: np.ndarray) -> Self:
-        """The set that states (..., 2d) of a system are of: their densities, and those of their densest blocks.
-
-        Raises
-        ------
-        ValueError
-            If they have no energy above that of the system at rest.
-        """
+        """The set that states (..., 2d) of a system are of; a ValueError if they have no energy above that of rest."""
         states = states.reshape(-1, 2 * system.ndof)
         means, blocks = cls.rest_of(system, states[0]).densities(states)
         low = float(np.quantile(means, SHARE, method="lower"))
@@ -100,13 +94,7 @@ class LatticeStates:
         return cls((low, high), system)
 
     def of(self, system: Hamiltonian) -> Self:
-        """The same set, of a system: itself where it is of one of that shape already, or of that by its coordinates.
-
-        Raises
-        ------
-        ValueError
-            If the system is not a lattice.
-        """
+        """The same set, of a system: itself where it is of one of that shape; a ValueError if it is not a lattice."""
         if self.system is not None and system.symbols is not None and system.ndof == self.system.ndof:
             return self
         other = self.checked(system)

@@ -12,13 +12,12 @@ from sympflow.arrays import to_numpy
 from sympflow.compiler.program import Program, adjoint, gradient, tangent, traced
 from sympflow.compiler.tracing import Chain, Untraceable
 
-__all__ = ["LayeredPotential"]
-
 MOST_FEATURES, MOST_OUTPUTS = 1024, 16  # of all layers, and of the last one
 
 
 class LayeredPotential:
     """V(q) as a chain of linear layers, a_l = W_l x_l + b_l with x_{l+1} = σ(a_l), and ½ p·M⁻¹p.
+
     `first` leads from q to x_1, a layer from and to as many numbers as `sizes` says; `tensors` are weights and biases.
     """
 

@@ -68,9 +68,8 @@ class LinearPart(NormalModes):
     inverse_mass: np.ndarray  # B (d, d), symmetric positive semidefinite
     stiffness_matrix: np.ndarray  # K (d, d), symmetric
     center: np.ndarray  # c (d,): where the forces along stiff directions vanish, of a system given by functions
-    potential: sp.Expr | None = None  # U(q), what V has beside the quadratic part, if the system is symbolic
+    potential: Any = None  # U(q), what V has beside the quadratic part, if the system is symbolic
     interval: float = 0.0  # length of the system's default interval
-
     dense: ClassVar[bool] = True
     """False of modes by fast transforms, which have no loops."""
 
@@ -209,11 +208,8 @@ def linear_part(system: Any) -> LinearPart:
     Of H = T(p) + V(q) or of any other H the terms ½ pᵀBp + ½ qᵀKq + linear ones are taken, where B belongs to
     coordinates whose kinetic energy is quadratic. What remains is U. Terms that depend on t are part of U.
 
-    Raises
-    ------
-    ValueError
-        If there is none; or if it is stiff in a direction that turns over the domain, which no constant K follows; or
-        if the system has friction.
+    A ValueError if there is none; or if it is stiff in a direction that turns over the domain, which no constant K
+    follows; or if the system has friction.
     """
     check_parts_conservative(system)
     part: LinearPart | None
@@ -549,11 +545,9 @@ class Transform:
         """θ of the waves along an axis, the phase from one site to the next: (n,), in 0 … π."""
         n = self.shape[axis]
         k = np.arange(n)
-        return {
-            "periodic": 2 * np.pi * ((k + 1) // 2) / n,
-            "fixed": np.pi * (k + 1) / (n + 1),
-            "free": np.pi * k / n,
-        }[self.boundary[axis]]
+        return {"periodic": 2 * np.pi * ((k + 1) // 2) / n, "fixed": np.pi * (k + 1) / (n + 1), "free": np.pi * k / n}[
+            self.boundary[axis]
+        ]
 
     def total(self, per_axis: Sequence[np.ndarray]) -> np.ndarray:
         """The sum of values by the waves of each axis, (n, …) each: (*shape, …)."""

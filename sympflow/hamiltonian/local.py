@@ -24,8 +24,6 @@ from sympflow.hamiltonian.definition import Definition, bare_copy
 from sympflow.hamiltonian.expression import complex_part, stated
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, generate, printable
 
-__all__ = ["LocalHamiltonian", "check_memory", "checked_params", "named_values", "numbered", "parsed"]
-
 MOST_SPELLED = 128  # degrees of freedom
 MOST_DENSE = 50_000_000  # entries of matrices ∇²V that are made at a time
 VECTORS_OF_A_RUN = 12
@@ -33,11 +31,7 @@ VECTORS_OF_A_RUN = 12
 
 
 class LocalHamiltonian(Definition, ABC):
-    """H = T(p) + V(q) as a sum over sites and bonds, or over pairs, by one expression for each kind of term.
-
-    A subclass defines `potential`, `potential_gradient`, `hessian_vector`, `third_derivative` and, unless T is
-    quadratic, `kinetic` and its derivatives; all of arrays and tensors (..., d), at the cost of O(d).
-    """
+    """H = T(p) + V(q) as a sum over sites and bonds, or over pairs, by one expression for each kind of term."""
 
     separable = True
     has_third_derivative = True

@@ -14,17 +14,14 @@ from sympflow.arrays import Array, like, stack
 if TYPE_CHECKING:
     from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 
-__all__ = ["MOST_MONOMIALS", "Monomials", "in_monomials", "monomials"]
 
 MOST_MONOMIALS = 60
 MOST_MIRRORED = 6  # coordinates of which all combinations of signs are tried
-
 Monomials = tuple[tuple[int, ...], ...]  # exponents of q1 … qd, one tuple a monomial
 
 
 def monomials(symbols: SymbolicHamiltonian, degree: int) -> Monomials:
     """Return the monomials up to a total degree that a kick of a trained flow can use, for H = ½ pᵀM⁻¹p + V(q)."""
-    assert symbols.V is not None
     d = symbols.ndof
     if math.comb(d + degree, d) > 1000 * MOST_MONOMIALS:
         raise ValueError(_too_many(degree, d))
@@ -41,7 +38,6 @@ def _generated(symbols: SymbolicHamiltonian, degree: int) -> set[tuple[int, ...]
     import sympy as sp
 
     M = symbols.inverse_mass
-    assert M is not None
     d = symbols.ndof
     pairs = [(i, j) for i in range(d) for j in range(d) if M[i, j] != 0]
     of_v = {m for m in sp.Poly(symbols.V, *symbols.q).monoms() if any(m)}
@@ -62,10 +58,13 @@ def _product(f: Sequence[int], g: Sequence[int], i: int, j: int) -> tuple[int, .
 
 def _as_even(symbols: SymbolicHamiltonian, degree: int) -> list[tuple[int, ...]]:
     """The monomials that are as even as V."""
-    mirrored = [signs for signs in _signs(symbols.ndof) if _is_even(symbols, signs)]
+    import sympy as sp
+
     found = [m for m in itertools.product(range(degree + 1), repeat=symbols.ndof) if 1 <= sum(m) <= degree]
-    for signs in mirrored:
-        found = [m for m in found if math.prod(sign**e for sign, e in zip(signs, m, strict=True)) == 1]
+    for signs in _signs(symbols.ndof):
+        mirrored = symbols.V.xreplace({s: sign * s for s, sign in zip(symbols.q, signs, strict=True)})
+        if sp.expand(mirrored - symbols.V) == 0:
+            found = [m for m in found if math.prod(sign**e for sign, e in zip(signs, m, strict=True)) == 1]
     return found
 
 
@@ -83,14 +82,6 @@ def _signs(d: int) -> Iterator[tuple[int, ...]]:
     for i in range(d):
         yield tuple(-1 if j == i else 1 for j in range(d))
     yield (-1,) * d
-
-
-def _is_even(symbols: SymbolicHamiltonian, signs: Sequence[int]) -> bool:
-    import sympy as sp
-
-    assert symbols.V is not None
-    mirrored = symbols.V.xreplace({s: sign * s for s, sign in zip(symbols.q, signs, strict=True)})
-    return sp.expand(mirrored - symbols.V) == 0
 
 
 def in_monomials(f: Any, symbols: SymbolicHamiltonian, of: Monomials) -> np.ndarray | None:

@@ -89,7 +89,6 @@ class ParameterRows:
         for index in _groups(kinds) if kinds else [np.arange(math.prod(self.shape))]:
             rows = self.taken(index)
             system = self._formed(tuple(float(kind[index[0] if len(kind) > 1 else 0]) for kind in kinds), int(index[0]))
-            assert system.symbols is not None
             form = system.symbols.parametric
             parameters = [rows._part(part) for part in form.meanings]
             swept = any(self._swept(part) for part in form.meanings)
@@ -117,7 +116,6 @@ class ParameterRows:
 
     def _part(self, part: sp.Expr) -> np.ndarray:
         """The values of a part of H that depends on parameters alone, by SymPy; NaN where they are not real."""
-        assert self.system.symbols is not None
         fixed = self.system.symbols.written[1]
         columns = {s: self._columns[s.name] for s in part.free_symbols if s.name in self._columns}
         part = part.xreplace({s: value for s, value in fixed.items() if s not in columns})
@@ -170,7 +168,6 @@ class ParameterRows:
 
     def _generated(self, of: Callable[[sp.Expr, Sequence[sp.Symbol]], sp.Expr]) -> Any:
         symbols = self.system.symbols
-        assert symbols is not None
         H, values = symbols.written
         H = H.xreplace({s: value for s, value in values.items() if s.name not in self.values})
         parameters, y = [sp.Symbol(name, real=True) for name in self.values], [*symbols.q, *symbols.p]

@@ -8,6 +8,7 @@ of its own, `turned`, and says so by `turns`.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -24,6 +25,7 @@ from sympflow.hamiltonian.linear_part import (
     linear_part,
     read_off,
 )
+from sympflow.hamiltonian.scales import fastest_rate, natural_scale
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, parse
 from sympflow.hamiltonian.times import stage_time
 from sympflow.lazy import kept
@@ -83,9 +85,7 @@ class ExactParts:
     `rest` are the parts 1, 2, …; `sequence` is the order of a splitting, the last innermost: kicks outside by default.
     """
 
-    def __init__(
-        self, linear: LinearPart | None, rest: Sequence[Any], ndof: int, sequence: Sequence[int] | None = None
-    ) -> None:
+    def __init__(self, linear: Any, rest: Sequence[Any], ndof: int, sequence: Sequence[int] | None = None) -> None:
         self.linear, self.rest, self.ndof = linear, tuple(rest), ndof
         self.sequence = tuple(range(1, len(self.rest) + 1)) + (LINEAR,) * (linear is not None)
         if sequence is not None:
@@ -152,8 +152,13 @@ class ExactParts:
                 X, Y = self.linear_flow(X, Y, m.length)
                 continue
             time = (stage_time(t, m.at, h),) if self.timed(m.part) else ()
-            if self.rest[m.part - 1].turns:
-                X, Y = self._turned(m, X, Y)
+            if self.rest[m.part - 1].turns:  # its change alone is transformed, so that transforms add no drift
+                y = self.from_modes(X, Y)
+                change = self.rest[m.part - 1].turned(y, each_mode(m.length)) - y
+                dX, dY = change[..., : self.ndof], change[..., self.ndof :]
+                if self.linear is not None:
+                    dX, dY = self.linear.coordinates(dX), self.linear.slopes(dY)
+                X, Y = X + dX, Y + dY
                 continue
             dX, dY = self.slopes(m.part, X, Y, m.filters, *time)
             length = each_mode(m.length)
@@ -185,15 +190,6 @@ class ExactParts:
             P = P - each_mode(length) * linear.slopes(of.hessian_vector(y[..., None, :], linear.positions(U), *time))
         return (X, Y), (U, P)
 
-    def _turned(self, m: SubFlow, X: Array, Y: Array) -> tuple[Array, Array]:
-        """The flow of a part that brings its own: its change alone is transformed, so that transforms add no drift."""
-        y = self.from_modes(X, Y)
-        change = self.rest[m.part - 1].turned(y, each_mode(m.length)) - y
-        dX, dY = change[..., : self.ndof], change[..., self.ndof :]
-        if self.linear is None:
-            return X + dX, Y + dY
-        return X + self.linear.coordinates(dX), Y + self.linear.slopes(dY)
-
     def linear_flow(self, X: Array, Y: Array, s: Any) -> tuple[Array, Array]:
         """The linear part over the times s (..., F), or by the shears that `prepared` has put in their place."""
         return sheared(X, Y, s if isinstance(s, tuple) else self._shears(s, X))
@@ -203,12 +199,10 @@ class ExactParts:
         return [replace(m, length=self._shears(m.length, X)) if m.part == LINEAR else m for m in maps]
 
     def _shears(self, s: Any, X: Array) -> tuple[Array, Array, Array, Array]:
-        assert self.linear is not None
         return shears(self.linear.kinds, like(self.linear.rates, X), self.by_class(like(s, X)))
 
     def linear_energies(self, X: Array, Y: Array) -> Array:
         """Energy of the linear part in each frequency: (..., F)."""
-        assert self.linear is not None
         sign = {"oscillator": 1.0, "hyperbolic": -1.0, "free": 0.0, "idle": 0.0}
         squares = like(np.array([sign[k] for k in self.linear.kinds]), X) * X * X + Y * Y
         energies = like(self.linear.rates, X) * squares / 2
@@ -232,7 +226,6 @@ class ExactParts:
     def force_gradient(self, part: int, X: Array, filters: Array | None, *t: Any) -> Array:
         """½ ∇|∇U|²_{M⁻¹} of U(X) = H_k(c + C φ X): (..., d)."""
         functions, d, linear = self.rest[part - 1], self.ndof, self.linear
-        assert linear is not None
         y = self._state(part, X, 0 * X, filters)
         phi = 1.0 if filters is None else self.by_class(like(filters, X))
         v = self.inverse_masses(X) * phi * linear.slopes(functions.gradient(y, *t)[..., :d])
@@ -241,7 +234,6 @@ class ExactParts:
 
     def inverse_masses(self, X: Array) -> Array:
         """The diagonal M⁻¹ of the modes: Ω of each."""
-        assert self.linear is not None
         return like(self.linear.rates, X)
 
     def _state(self, part: int, X: Array, Y: Array, filters: Array | None) -> Array:
@@ -370,11 +362,9 @@ def _detected(system: HamiltonianSystem) -> ExactParts:
     import sympy as sp
 
     symbols = system.written
-    assert symbols is not None
     try:
         linear = linear_part(system)
         rest = linear.potential
-        assert rest is not None
     except ValueError:
         linear, rest = None, symbols.H
     if _groups(rest, symbols) is None:
@@ -417,7 +407,6 @@ def _given(system: HamiltonianSystem, expressions: tuple[str, ...]) -> ExactPart
     import sympy as sp
 
     symbols = system.written
-    assert symbols is not None
     parts = [_parsed(expression, system) for expression in expressions]
     difference = sp.expand(sp.Add(*parts) - symbols.H)
     probes = np.random.default_rng(0).uniform(0.3, 0.9, (8, 2 * system.ndof))
@@ -450,7 +439,6 @@ def _given(system: HamiltonianSystem, expressions: tuple[str, ...]) -> ExactPart
 def _parsed(expression: str, system: HamiltonianSystem) -> sp.Expr:
     """A part in the symbols q1 … pd of the system."""
     symbols = system.written
-    assert symbols is not None
     if not isinstance(expression, str):
         raise ValueError(f"`parts` must be expressions as text; got {expression!r}.")
     words, time = set(re.findall(r"[A-Za-z_]\w*", expression)), symbols.time
@@ -473,3 +461,95 @@ def map_evaluations(maps: Sequence[SubFlow], n_steps: int, n_saved: int, n_extra
         last = maps[-1].part != LINEAR, maps[-1].has_gradient  # it is the next step's first one
         counts = [count - (n_steps - n_saved) * one for count, one in zip(counts, last, strict=True)]
     return {"force_evaluations": int(counts[0]), "hessian_evaluations": int(counts[1])}
+
+
+# two copies of phase space --------------------------------------------------------------------
+
+
+class Coupling(LinearPart):
+    """The coupling of the copies; its normal modes are the sums and differences of s q and s x over √2."""
+
+    @cached_property
+    def _spectrum(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        d, K, B = self.ndof // 2, self.stiffness_matrix, self.inverse_mass
+        s = np.diag((np.diag(K) / np.diag(B))[:d] ** 0.25)
+        C, inverse = (np.block([[one, one], [one, -one]]) / math.sqrt(2) for one in (np.linalg.inv(s), s))
+        return np.repeat([np.nan, 4 * K[0, 0] * B[0, 0]], d), C, inverse
+
+
+class FunctionsOfCopies:
+    """H(q, y), or H(x, p), of a system that is given by functions."""
+
+    of_positions, turns = False, False
+
+    def __init__(self, system: HamiltonianSystem, first: bool) -> None:
+        self.system, self.first, self.ndof = system, first, 2 * system.ndof
+        self.timed = system.definition.timed
+
+    def hamiltonian(self, x: Array, *t: Any) -> Array:
+        return self.system.hamiltonian(self._state(x), *t)
+
+    def gradient(self, x: Array, *t: Any) -> Array:
+        d, g = self.system.ndof, self.system.gradient(self._state(x), *t)
+        zero = 0 * g[..., :d]
+        return concatenate([g[..., :d], zero, zero, g[..., d:]] if self.first else [zero, g, zero])
+
+    def _state(self, x: Array) -> Array:
+        d = self.system.ndof
+        return concatenate([x[..., :d], x[..., 3 * d :]]) if self.first else x[..., d : 3 * d]
+
+
+@kept
+def two_copies(system: HamiltonianSystem, omega: float | None) -> ExactParts:
+    """Any H on two copies of phase space, (q, p) and (x, y), as three parts with exact flows of states [q, x, p, y].
+
+    H(q, y) + H(x, p) + ω Σ_i (s_i² (q_i − x_i)² + (p_i − y_i)²/s_i²)/2 has the solutions of H where the copies agree
+    [1]_, [2]_. The last part is the innermost, and moves the time; s = √(mω) is `natural_scale`, 1 in Tao's paper. ω is
+    by default the fastest rate of the motion.
+
+    References
+    ----------
+    .. [1] P. Pihajoki, "Explicit methods in extended phase space for inseparable Hamiltonian problems", Celest. Mech.
+       Dyn. Astron. 121 (2015) 211–231.
+    .. [2] M. Tao, "Explicit symplectic approximation of nonseparable Hamiltonians: algorithm and long time
+       performance", Phys. Rev. E 94 (2016) 043303.
+    """
+    omega = fastest_rate(system) if omega is None else float(omega)
+    if omega is None:
+        raise ValueError(
+            f"`system` {system.name!r} has neither a `y0` of its own nor a domain to take the coupling from: give "
+            "`omega`, or the system one of these."
+        )
+    check_parts_conservative(system)
+    import sympy as sp
+
+    d, symbols = system.ndof, system.written
+    squares = np.diag(natural_scale(system) ** 2)
+    B, K = (omega * np.block([[one, -one], [-one, one]]) for one in (np.linalg.inv(squares), squares))
+    coupling = Coupling(B, K, np.zeros(2 * d))
+    if symbols is None:
+        return ExactParts(coupling, [FunctionsOfCopies(system, first) for first in (True, False)], 2 * d)
+    q, p = (tuple(sp.symbols(f"{letter}1:{2 * d + 1}", real=True)) for letter in "qp")
+    first = dict(zip((*symbols.q, *symbols.p), (*q[:d], *p[d:]), strict=True))
+    second = dict(zip((*symbols.q, *symbols.p), (*q[d:], *p[:d]), strict=True))
+    copies = [PartFunctions(symbols.H.xreplace(these), q, p, symbols) for these in (first, second)]
+    return ExactParts(coupling, copies, 2 * d)
+
+
+def both(y: Array, d: int) -> Array:
+    """[q, q, p, p] of states [q, p]: (..., 2d) to (..., 4d)."""
+    return concatenate([y[..., :d], y[..., :d], y[..., d:], y[..., d:]])
+
+
+def mean(x: Array, d: int) -> Array:
+    """The mean of the two copies, in which their difference cancels to first order: (..., 4d) to (..., 2d)."""
+    return concatenate([(x[..., :d] + x[..., d : 2 * d]) / 2, (x[..., 2 * d : 3 * d] + x[..., 3 * d :]) / 2])
+
+
+def distance(x: Array, s: np.ndarray) -> Array:
+    """The largest |s(q − x)| or |(p − y)/s|, and the largest of these variables: (..., 4d) to (..., 2)."""
+    d = len(s)
+    x = x * like(np.concatenate([s, s, 1 / s, 1 / s]), x)
+    apart = concatenate([x[..., :d] - x[..., d : 2 * d], x[..., 2 * d : 3 * d] - x[..., 3 * d :]])
+    xp = library(x)
+    return stack([xp.amax(abs(apart), -1), xp.amax(abs(x), -1)], axis=-1)

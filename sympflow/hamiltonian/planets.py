@@ -31,13 +31,11 @@ COORDINATES = ("jacobi", "democratic")
 ELEMENTS = ("a", "e", "inc", "node", "peri", "M")
 """Names of orbital elements: semi-major axis, eccentricity, inclination, longitude of the ascending node, argument of
 the pericentre, mean anomaly; angles in radians."""
-
 SUN = 1.3271244e20
 LENGTHS = {"m": 1.0, "km": 1e3, "AU": 149_597_870_700.0}
 TIMES = {"s": 1.0, "day": 86_400.0, "year": 365.25 * 86_400.0}
 MASSES = {"kg": 6.67430e-11, "solar mass": SUN, "Jupiter mass": 1.2668653e17, "Earth mass": 3.986004e14}
 """Units in SI, masses times G: IAU 2012 B2, IAU 2015 B3, CODATA 2018."""
-
 PLACE = "x", "y", "z", "r"  # names in an extra potential: the place of a body as seen from the star, and its distance
 FEWEST_STEPS = 20  # of a method in the shortest period
 MOON = 0.5  # of a Hill radius: bodies that are nearer may be bound
@@ -68,12 +66,7 @@ class Frame:
     """
 
     def __init__(
-        self,
-        local: PairsHamiltonian,
-        G: float,
-        y0: np.ndarray,
-        coordinates: str = "jacobi",
-        encounter: float | None = 1.0,
+        self, local: Any, G: float, y0: np.ndarray, coordinates: str = "jacobi", encounter: float | None = 1.0
     ) -> None:
         self.local, self.G, self.coordinates, self.encounter = local, G, coordinates, encounter
         masses = self.masses = local.masses
@@ -328,23 +321,13 @@ def newtonian(local: PairsHamiltonian) -> float | None:
 
 
 class PlanetsHamiltonian(PairsHamiltonian):
-    """H = Σ |p_i|²/2m_i − G Σ_{i<j} m_i m_j/r_ij, with a star, body 0: see `HamiltonianSystem.planets`.
-
-    Bodies of mass 0 have momenta per unit mass; they feel the others and are not felt.
-    """
+    """H = Σ |p_i|²/2m_i − G Σ_{i<j} m_i m_j/r_ij, with a star, body 0: see `HamiltonianSystem.planets`."""
 
     noun = "system of planets"
     extra: sp.Expr | None = None
 
     def __init__(
-        self,
-        masses: Any,
-        G: float,
-        y0: np.ndarray,
-        coordinates: Any,
-        encounter: Any,
-        extra: Any = None,
-        params: Any = None,
+        self, masses: Any, G: float, y0: Any, coordinates: Any, encounter: Any, extra: Any = None, params: Any = None
     ) -> None:
         if coordinates not in COORDINATES:
             raise ValueError(f"`coordinates` must be 'jacobi' or 'democratic'; got {coordinates!r}.")
@@ -392,10 +375,7 @@ class PlanetsHamiltonian(PairsHamiltonian):
         return [given[name] for name in self._letters]
 
     def extra_program(self, order: int) -> Program:
-        """The extra potential of a body at x, y, z from the star, with order 0; its slope, and along vectors that.
-
-        The numbers are x, y, z, those of `extra_values`, and the vectors.
-        """
+        """The extra potential of a body at x, y, z from the star, with order 0; its slope, and along vectors that."""
         if order not in self._programs:
             names = [*PLACE[:3], *self._letters, *(f"{name}{k}" for k in range(1, order) for name in PLACE[:3])]
 
@@ -469,12 +449,7 @@ class PlanetsHamiltonian(PairsHamiltonian):
         return self.felt is None and self.extra is None and super().is_few
 
     def written_potential(
-        self,
-        q: Sequence[sp.Expr],
-        softening: sp.Expr,
-        columns: Sequence[Sequence[sp.Expr]],
-        c: Mapping[sp.Symbol, sp.Expr],
-        box: Sequence[sp.Expr] = (),
+        self, q: Sequence[Any], softening: Any, columns: Sequence[Any], c: Mapping[Any, Any], box: Sequence[Any] = ()
     ) -> sp.Expr:
         V = super().written_potential(q, softening, columns, c, box)
         if self.extra is None:

@@ -13,8 +13,6 @@ import sympy as sp
 
 from sympflow.hamiltonian.removable import Min
 
-__all__ = ["LatticePoles", "PairsPoles", "Place", "Poles", "SymbolicPoles", "places"]
-
 FACTORED = 8  # letters of a polynomial, at most, that is split into factors
 MOST_SHOWN = 100  # characters of terms
 DIGITS, HALVINGS = 50, 100  # of the arithmetic in which H is judged beside such a place, and of the way to it
@@ -66,6 +64,9 @@ class Poles(Protocol):
     cancelling: Sequence[Cancelling]  # terms of H that cancel where each is infinite
     watched: bool  # False if H has cancelling terms alone
 
+    def __bool__(self) -> bool:
+        return self.watched or bool(self.cancelling)
+
     @property
     def exact(self) -> Poles | None:
         """The places by which runs are judged, where these may have passed one; None if they are not known."""
@@ -114,9 +115,6 @@ class SymbolicPoles(Poles):
         self._look = symbols.evaluated("cells", [*cells, symbols.H, T])
         self._sizes = symbols.evaluated("sizes", [place.g for place, _ in self._places])
 
-    def __bool__(self) -> bool:
-        return self.watched or bool(self.cancelling)
-
     def look(self, y: np.ndarray, t: Any, numbers: Sequence[Any] = ()) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         values = self._look(y, *self._time(y, t), numbers=numbers)
         return values[..., : self._m], values[..., -2], values[..., -1]
@@ -151,9 +149,6 @@ class LatticePoles(Poles):
             names = [sp.Symbol(name, real=True) for name in lattice.names["x" if k is None else "r"]]
             named = _with_numbers(f, lattice.c, lattice.params).xreplace(dict(zip(x, names, strict=True)))
             self.cancelling += [each._replace(bond=k) for each in cancelling(named, tuple(names))]
-
-    def __bool__(self) -> bool:
-        return self.watched or bool(self.cancelling)
 
     def visited(self, terms: Cancelling, y: np.ndarray) -> np.ndarray:
         rows = self._lattice.of_terms("own", lambda f, x: [*x], self._positions(y))
@@ -236,9 +231,6 @@ class PairsPoles(Poles):
         self.watched = bool(self._places)
         self._only_meet = not self._on_a_line and [place.cell for place in self._places] == [self._meeting]
         self.cancelling = cancelling(_with_numbers(self._f, pairs.c, pairs.params), (self._x,))
-
-    def __bool__(self) -> bool:
-        return self.watched or bool(self.cancelling)
 
     def may_pass(self, y: np.ndarray) -> bool:
         return not self._only_meet or self._pairs.may_pass(y)
@@ -330,7 +322,6 @@ _SINGULAR: dict[Any, Callable[..., Sequence[sp.Expr]]] = {
     sp.besselk: lambda n, a: [a],
 }
 """Expressions that vanish where a function is infinite, or ends."""
-
 _ENDING = sp.log, sp.asin, sp.acos, sp.acosh, sp.atanh, sp.LambertW, sp.elliptic_k, sp.elliptic_e
 _ODD = sp.sinh, sp.tanh, sp.asinh, sp.atan, sp.erf, sp.sign
 

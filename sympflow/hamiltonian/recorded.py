@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import reduce
+from functools import partial, reduce
 from operator import add
 from typing import Any
 
@@ -15,8 +15,6 @@ from sympflow.compiler import NotCompiled
 from sympflow.compiler.functions import MOST_DERIVATIVES, apply, where
 from sympflow.compiler.program import Program, Traced
 from sympflow.hamiltonian.removable import Max, Min, sinc
-
-__all__ = ["NotRecorded", "calculated", "can_be_recorded", "check_recorded", "in_symbols"]
 
 
 class NotRecorded(NotCompiled):
@@ -47,48 +45,41 @@ def _sinc(x: Any) -> Any:
     return where(near, series, apply("sin", far) / far)
 
 
+_SAME = (
+    *("exp", "log", "sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh", "asinh", "acosh"),
+    *("atanh", "erf", "erfc", "sign", "floor", "gamma"),
+)
+"""Functions of the same name here and there."""
 # fmt: off
+_OTHER = {
+    "jv": sp.besselj, "yv": sp.bessely, "iv": sp.besseli, "kv": sp.besselk, "ellipk": sp.elliptic_k, "expi": sp.Ei,
+    "mod": sp.Mod, "lt": sp.StrictLessThan, "le": sp.LessThan, "eq": sp.Equality, "not": sp.Not,
+}
+"""SymPy's functions of those that have other names."""
+_BOTH: dict[str, Any] = {name: getattr(sp, name) for name in _SAME} | _OTHER
 _RULES: dict[type, Callable[..., Any]] = {
-    sp.exp: lambda x: apply("exp", x), sp.log: lambda x: apply("log", x),
-    sp.sin: lambda x: apply("sin", x), sp.cos: lambda x: apply("cos", x), sp.tan: lambda x: apply("tan", x),
+    **{function: partial(apply, name) for name, function in _BOTH.items()},
     sp.cot: _reciprocal("tan"), sp.sec: _reciprocal("cos"), sp.csc: _reciprocal("sin"),
-    sp.asin: lambda x: apply("asin", x), sp.acos: lambda x: apply("acos", x), sp.atan: lambda x: apply("atan", x),
-    sp.acot: lambda x: apply("atan", 1.0 / x), sp.atan2: lambda y, x: apply("atan2", y, x),
-    sp.sinh: lambda x: apply("sinh", x), sp.cosh: lambda x: apply("cosh", x), sp.tanh: lambda x: apply("tanh", x),
+    sp.acot: lambda x: apply("atan", 1.0 / x), sp.Abs: abs,
     sp.coth: _reciprocal("tanh"), sp.sech: _reciprocal("cosh"), sp.csch: _reciprocal("sinh"),
-    sp.asinh: lambda x: apply("asinh", x), sp.acosh: lambda x: apply("acosh", x),
-    sp.atanh: lambda x: apply("atanh", x), sp.erf: lambda x: apply("erf", x),
-    sp.erfc: lambda x: apply("erfc", x), sp.Abs: abs, sp.sign: lambda x: apply("sign", x),
-    sp.besselj: lambda n, x: apply("jv", n, x), sp.bessely: lambda n, x: apply("yv", n, x),
-    sp.besseli: lambda n, x: apply("iv", n, x), sp.besselk: lambda n, x: apply("kv", n, x),
-    sp.gamma: lambda x: apply("gamma", x), sp.loggamma: lambda x: where(x > 0.0, apply("lgamma", x), float("nan")),
+    sp.loggamma: lambda x: where(x > 0.0, apply("lgamma", x), float("nan")),
     sp.lowergamma: lambda s, x: apply("gamma", s) * apply("gammainc", s, x),
     sp.uppergamma: lambda s, x: apply("gamma", s) * apply("gammaincc", s, x),
-    sp.elliptic_k: lambda m: apply("ellipk", m), sp.Ei: lambda x: apply("expi", x),
-    sp.polygamma: lambda n, x: apply(f"polygamma{int(n)}" if n else "digamma", x),
-    sp.sinc: _sinc, sp.floor: lambda x: apply("floor", x), sp.Mod: lambda x, y: apply("mod", x, y),
+    sp.polygamma: lambda n, x: apply(f"polygamma{int(n)}" if n else "digamma", x), sp.sinc: _sinc,
     Max: _folded("max"), Min: _folded("min"), sp.And: _folded("and"), sp.Or: _folded("or"),
-    sp.Not: lambda x: apply("not", x),
-    sp.StrictLessThan: lambda x, y: apply("lt", x, y), sp.LessThan: lambda x, y: apply("le", x, y),
     sp.StrictGreaterThan: lambda x, y: apply("lt", y, x), sp.GreaterThan: lambda x, y: apply("le", y, x),
-    sp.Equality: lambda x, y: apply("eq", x, y), sp.Unequality: lambda x, y: apply("not", apply("eq", x, y)),
+    sp.Unequality: lambda x, y: apply("not", apply("eq", x, y)),
 }
 # fmt: on
-
-
 EXACT = 2.0**53
 # fmt: off
-_SYMBOLS: dict[str, Callable[..., sp.Expr]] = {
+_SYMBOLS: dict[str, Callable[..., sp.Expr]] = _BOTH | {
     "add": lambda x, y: x + y, "sub": lambda x, y: x - y, "mul": lambda x, y: x * y, "times": lambda x, y: x * y,
     "div": lambda x, y: x / y, "neg": lambda x: -x, "fma": lambda x, y, z: x * y + z,
     "pow": lambda x, n: x ** (sp.nsimplify(n) if n.is_Float and 2 * n % 1 == 0 else n), "sqrt": sp.sqrt,
-    "abs": sp.Abs, "sign": sp.sign, "floor": sp.floor, "mod": sp.Mod, "min": Min, "max": Max, "lt": sp.Lt,
-    "le": sp.Le, "eq": sp.Eq, "and": sp.And, "or": sp.Or, "not": sp.Not,
-    "where": lambda c, x, y: sp.Piecewise((x, c), (y, True)), "exp": sp.exp, "expm1": lambda x: sp.exp(x) - 1,
-    "log": sp.log, "log1p": lambda x: sp.log(1 + x), "sin": sp.sin, "cos": sp.cos, "tan": sp.tan, "asin": sp.asin,
-    "acos": sp.acos, "atan": sp.atan, "atan2": sp.atan2, "sinh": sp.sinh, "cosh": sp.cosh, "tanh": sp.tanh,
-    "asinh": sp.asinh, "acosh": sp.acosh, "atanh": sp.atanh, "erf": sp.erf, "erfc": sp.erfc, "jv": sp.besselj,
-    "yv": sp.bessely, "iv": sp.besseli, "kv": sp.besselk, "gamma": sp.gamma, "ellipk": sp.elliptic_k, "expi": sp.Ei,
+    "abs": sp.Abs, "min": Min, "max": Max, "and": sp.And, "or": sp.Or,
+    "where": lambda c, x, y: sp.Piecewise((x, c), (y, True)), "expm1": lambda x: sp.exp(x) - 1,
+    "log1p": lambda x: sp.log(1 + x),
 }
 # fmt: on
 

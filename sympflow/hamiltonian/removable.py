@@ -9,8 +9,6 @@ from typing import Any
 import sympy as sp
 from sympy.core.sorting import ordered
 
-__all__ = ["Max", "Min", "sinc", "with_own_functions"]
-
 TERMS = 14  # of the series of sin(x)/x, enough for its first derivatives too
 SERIES_UP_TO = 2.0
 

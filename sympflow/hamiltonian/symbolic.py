@@ -43,6 +43,7 @@ from sympflow.hamiltonian.jumps import (
     borders,
     check_continuous,
     has_period,
+    refuse_deltas,
     split_impulses,
 )
 from sympflow.hamiltonian.poles import Poles, SymbolicPoles
@@ -95,8 +96,7 @@ class SymbolicHamiltonian(Definition):
     meanings: tuple[sp.Expr, ...] = ()
     _written: tuple[sp.Expr, dict[sp.Symbol, sp.Expr]] | None = None
     """H as it was written, and the values of its parameters; None without any."""
-
-    time: sp.Symbol | None = None
+    time: Any = None
     named_time: sp.Symbol | None = None
     """The time as it was given; `time` is None where H, by the values of its parameters, does not depend on it."""
     samples: Mapping[str, Samples] = MappingProxyType({})
@@ -105,10 +105,7 @@ class SymbolicHamiltonian(Definition):
     _rest: SymbolicHamiltonian | None = None  # H without its impulses, where it has some
 
     def __init__(
-        self,
-        expression: str | sp.Expr,
-        params: Mapping[str, Any] | None = None,
-        time: str | sp.Symbol | None = None,
+        self, expression: str | sp.Expr, params: Mapping[str, Any] | None = None, time: str | sp.Symbol | None = None
     ) -> None:
         params = checked_params(params)
         self.time = self.named_time = named_time(time, params)
@@ -302,7 +299,6 @@ class SymbolicHamiltonian(Definition):
 
     def has_period(self, period: float) -> bool:
         """Return True if H, up to a function of t alone, has a period in t."""
-        assert self.time is not None
         return has_period(self.H, self.time, (*self.q, *self.p), self.samples, period)
 
     @cached_property
@@ -316,7 +312,7 @@ class SymbolicHamiltonian(Definition):
         return drift(tuple(gradient(self.T, self.p)), self.time)
 
     @cached_property
-    def inverse_mass(self) -> sp.Matrix | None:
+    def inverse_mass(self) -> Any:
         """M⁻¹ if T = ½ pᵀM⁻¹p exactly, else None."""
         if self.T is None or not self.T.is_polynomial(*self.p):
             return None
@@ -334,20 +330,18 @@ class SymbolicHamiltonian(Definition):
     @cached_property
     def force_gradient(self) -> sp.Expr:
         """−½|∇V|²_{M⁻¹}."""
-        assert self.inverse_mass is not None
         slope = sp.Matrix(self.slope)
         return -(slope.T * self.inverse_mass * slope)[0] / 2
 
     @cached_property
     def W(self) -> sp.Expr:
         """½ v·∇²V v with v = M⁻¹∇V."""
-        assert self.inverse_mass is not None
         slope = sp.Matrix(self.slope)
         v = self.inverse_mass * slope
         return (v.T * sp.hessian(self.V, self.q) * v)[0] / 2
 
     @cached_property
-    def poles(self) -> Poles | None:  # type: ignore[override]
+    def poles(self) -> Poles | None:
         return SymbolicPoles(self) or None
 
     # array functions, state y = [q, p] on the last axis -------------------------------------------
@@ -417,18 +411,15 @@ class SymbolicHamiltonian(Definition):
         return self._function(name + "'" * order, expressions, (_single, assemble, _square)[order])
 
     def _function(
-        self,
-        key: str,
-        expressions: Callable[[], list[sp.Expr]],
-        collect: Callable[[Sequence[Array], Array], Array],
+        self, key: str, expressions: Callable[[], list[sp.Expr]], collect: Callable[[Sequence[Array], Array], Array]
     ) -> Callable[..., Array]:
         """A function of an array (..., n), and of the time, generated for NumPy or torch when first called with one."""
         if key in self._functions:
             return self._functions[key]
         name = key.rstrip("'")
         variables = self._variables(name)
-        n = len(variables)
-        moving = self._moving(name)
+        n, timed = len(variables), self.kinetic_timed if name in ("T", "drift") else self.timed
+        moving = (self.time,) * timed + (DURATION,) * (name == "drift")
         generated: dict[str, Callable[..., list[Any]]] = {}
         values_of_samples: list[tuple[sampled, Callable[..., Any]]] = []
 
@@ -455,11 +446,6 @@ class SymbolicHamiltonian(Definition):
 
         self._functions[key] = function
         return function
-
-    def _moving(self, name: str) -> tuple[sp.Symbol, ...]:
-        """The times that a function takes after the states."""
-        timed = self.kinetic_timed if name in ("T", "drift") else self.timed
-        return (self.time,) * timed + (DURATION,) * (name == "drift")
 
     _generated = ("_functions", "_switches", "poles")
 
@@ -729,7 +715,7 @@ def without_deltas(f: sp.Expr) -> sp.Expr:
     return f.replace(sp.DiracDelta, lambda *arguments: sp.S.Zero) if f.has(sp.DiracDelta) else f
 
 
-def _split(H: sp.Expr, q: tuple[sp.Symbol, ...], p: tuple[sp.Symbol, ...]) -> tuple[sp.Expr | None, sp.Expr | None]:
+def _split(H: sp.Expr, q: tuple[sp.Symbol, ...], p: tuple[sp.Symbol, ...]) -> tuple[Any, Any]:
     """V(q) and T(p) with H = T + V, or (None, None). Constants go to V."""
     qs, ps = set(q), set(p)
     terms = sp.Add.make_args(H)
@@ -770,9 +756,12 @@ def generate(expressions: Sequence[sp.Expr], variables: Sequence[sp.Symbol], lib
     code = []
     for f in expressions:
         large = [n for n in f.atoms(sp.Integer) if abs(n) >= 2**63]  # which no 64 bits hold
-        written = _by_reciprocals(f.xreplace({n: sp.Float(int(n)) for n in large}))
+        written = f.xreplace({n: sp.Float(int(n)) for n in large})
+        for of, reciprocal in _RECIPROCALS.items():
+            written = written.replace(of, reciprocal) if written.has(of) else written
         code.append(_by_products(written) if library == "numpy" else written.replace(sp.erfc, tensor_erfc))
-    sums = [_in_pieces(f) for f in code]
+    n = LONGEST_SUM  # Python's compiler nests sums as deep as they have terms
+    sums = [[sp.Add(*f.args[i : i + n]) for i in range(0, len(f.args), n)] if f.is_Add else [f] for f in code]
     pieces = [piece for f in sums for piece in f]
     try:
         function = sp.lambdify(variables, pieces, modules=_modules(library, code), cse=True)
@@ -788,13 +777,6 @@ def generate(expressions: Sequence[sp.Expr], variables: Sequence[sp.Symbol], lib
         return [reduce(add, islice(values, len(f))) for f in sums]
 
     return summed
-
-
-def _in_pieces(f: sp.Expr) -> list[sp.Expr]:
-    """A sum as sums of up to `LONGEST_SUM` terms: Python's compiler nests them as deep as they have terms."""
-    if not f.is_Add or len(f.args) <= LONGEST_SUM:
-        return [f]
-    return [sp.Add(*f.args[i : i + LONGEST_SUM]) for i in range(0, len(f.args), LONGEST_SUM)]
 
 
 def _by_products(f: sp.Expr) -> sp.Expr:
@@ -827,13 +809,6 @@ _RECIPROCALS: dict[Any, Callable[[Any], Any]] = {
     sp.acot: lambda x: sp.atan(1 / x, evaluate=False),
 }
 """Functions that torch has not, and that SymPy writes for NumPy by exponentials, which cancel near 0 and overflow."""
-
-
-def _by_reciprocals(f: sp.Expr) -> sp.Expr:
-    for function, written in _RECIPROCALS.items():
-        if f.has(function):
-            f = f.replace(function, written)
-    return f
 
 
 def _integer_power(x: np.ndarray, n: int) -> np.ndarray:
@@ -893,3 +868,82 @@ def _modules(library: str, code: list[sp.Expr]) -> list[Any]:
         },
         "torch",
     ]
+
+
+class SymbolicForce:
+    """F(q, p) by expressions, one for each momentum."""
+
+    def __init__(self, system: Any, force: Any, params: Mapping[str, float] | None) -> None:
+        symbols = system.symbols
+        self.q, self.p, self.time = symbols.q, symbols.p, symbols.time
+        self.form = symbols.like(symbols.H)  # with functions of its own
+        d = system.ndof
+        several = isinstance(force, Sequence | np.ndarray | sp.MatrixBase) and not isinstance(force, str)
+        written = list(force) if several else [force]
+        if len(written) != d:
+            raise ValueError(
+                f"`force` must have {d} components, one for each momentum of {system.name!r}; got {len(written)}."
+            )
+        values = {**system.params, **checked_params(params)}
+        read_ones = [stated("force", each, values) for each in written]
+        if any(complex_part(f) is not None for f in read_ones):
+            raise TypeError("`force` must be real expressions, texts or SymPy's, or a function F(q, p).")
+        for name in params or {}:
+            if not any(sp.Symbol(name, real=True) in f.free_symbols for f in read_ones):
+                raise ValueError(f"`params` has {name!r}, which the force does not use: remove it.")
+        self.expressions = [self._valued(f, values) for f in read_ones]
+        for f in self.expressions:
+            refuse_deltas("force", f)
+
+    def _valued(self, f: sp.Expr, values: Mapping[str, float]) -> sp.Expr:
+        """The expression in the system's coordinates, its parameters replaced by their values."""
+        d = len(self.q)
+        known: dict[sp.Symbol, sp.Expr] = {sp.Symbol(name, real=True): exact(value) for name, value in values.items()}
+        if d == 1:
+            known |= {sp.Symbol("q", real=True): self.q[0], sp.Symbol("p", real=True): self.p[0]}
+        f = f.xreplace(known)
+        unknown = sorted(s.name for s in f.free_symbols - {*self.q, *self.p, self.time})
+        beyond = [name for name in unknown if COORDINATE.fullmatch(name)]
+        if beyond:
+            raise ValueError(
+                f"`force` holds {', '.join(beyond)}, but the system has the coordinates {self.q[0]} … {self.p[-1]}: "
+                "write it in these."
+            )
+        if "t" in unknown:
+            raise ValueError(
+                "`force` depends on the time t, but the system does not: leave t out, or name the time of the system."
+            )
+        if unknown:
+            raise ValueError(f"`force` holds {', '.join(unknown)} without a value: give it in `params`.")
+        return f
+
+    def __call__(self, q: Array, p: Array, *t: Any) -> Array:
+        return self.form.evaluated("force", self.expressions)(concatenate([q, p]), *t)
+
+    def jacobian(self, q: Array, p: Array, *t: Any) -> Array:
+        x = (*self.q, *self.p)
+        slopes = [sp.diff(f, s) for f in self.expressions for s in x]
+        return self.form.evaluated("force 1", slopes)(concatenate([q, p]), *t).reshape(*p.shape, len(x))
+
+    @property
+    def has_potential(self) -> bool:
+        """True if F is −∇U(q)."""
+        F, q = self.expressions, self.q
+        if any(f.free_symbols & {*self.p} for f in F):
+            return False
+        return all(sp.expand(sp.diff(F[i], q[j]) - sp.diff(F[j], q[i])) == 0 for i in range(len(q)) for j in range(i))
+
+
+def doubled_hamiltonian(system: Any, force: SymbolicForce) -> sp.Expr:
+    """p₋·∂H/∂p + q₋·(∂H/∂q + Γp − F) in q1 … q2d, p1 … p2d, which are q₊, q₋ and p₋, p₊."""
+    symbols = system.symbols
+    d = system.ndof
+    q, p = (sp.symbols(f"{letter}1:{2 * d + 1}", real=True) for letter in "qp")
+    G = system.friction.matrix(d)
+    mean = dict(zip((*symbols.q, *symbols.p), (*q[:d], *p[d:]), strict=True))
+    terms = []
+    for i, F in enumerate(force.expressions):
+        drag = sp.Add(*[exact(g) * s for g, s in zip(G[i], symbols.p, strict=True) if g])
+        terms.append(p[i] * sp.diff(symbols.H, symbols.p[i]).xreplace(mean))
+        terms.append(q[d + i] * (sp.diff(symbols.H, symbols.q[i]) + drag - F).xreplace(mean))
+    return printable(sp.Add(*terms))

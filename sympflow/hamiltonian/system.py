@@ -4,23 +4,25 @@ from __future__ import annotations
 
 import copy
 import math
+import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
+from dataclasses import fields as dataclass_fields
 from functools import cached_property, lru_cache
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, ClassVar, NoReturn, Unpack
+from typing import TYPE_CHECKING, Any, ClassVar, NoReturn, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.arguments import check_flag, check_positive, checked_count, warn
+from sympflow.arguments import check_flag, check_positive, checked_count, floats, real_number, warn
 from sympflow.arrays import Array, one_lane
 from sympflow.hamiltonian.domain import Domain, domain_of
 from sympflow.hamiltonian.fingerprint import fingerprint
 from sympflow.hamiltonian.friction import Friction
 from sympflow.hamiltonian.hamiltonian import Hamiltonian
 from sympflow.hamiltonian.linear_part import checked_damping, checked_inverse_mass, checked_stiffness, numeric
-from sympflow.hamiltonian.scene import UNNAMED, Scene, SceneOptions
 from sympflow.hamiltonian.times import check_period, probe_times
 from sympflow.show.cards import Answering, Card, cut, numbers
 
@@ -46,6 +48,92 @@ SHOWN_NAMES = (
 """The attributes that `dir` lists: those that users need. All others are for methods and studies."""
 MOST_WRITTEN_OUT = 400
 """Coordinates of an expression before a warning: 512 of a chain take 2 s to define, and a step 14 times as long."""
+UNNAMED = "custom"
+MEANT = {
+    **dict.fromkeys(("dim", "dimension", "dimensions"), "degrees of freedom of a function are `ndof`, of pairs `dim`"),
+    **dict.fromkeys(("q0", "p0", "x0"), "the initial state is `y0`, [q, p] in one array"),
+    **dict.fromkeys(("h", "step"), "the step is `dt`"),
+    **dict.fromkeys(("mass", "m"), "masses are in T(p), or `masses` of pairs"),
+    **dict.fromkeys(
+        ("site", "sites", "n_sites"), "the number of sites of a lattice is `shape`, their potential `onsite`"
+    ),
+}
+"""Remedies for arguments that other packages have."""
+
+
+class SceneOptions(TypedDict, total=False):
+    """The arguments of a scene, as every constructor of a system takes them."""
+
+    name: str
+    domain: Domain | None
+    y0: ArrayLike | None
+    t_span: tuple[float, float]
+    dt: float | None
+    energy_scale: float | None
+    exact: Callable[[Any], Array] | None
+
+
+@dataclass(frozen=True)
+class Scene:
+    """The defaults with which a system is solved: see `HamiltonianSystem`."""
+
+    name: str = UNNAMED
+    domain: Domain | None = None
+    y0: Any = None
+    t_span: tuple[float, float] = (0.0, 100.0)
+    dt: float | None = None
+    energy_scale: float | None = None
+    exact: Callable[[Any], Array] | None = None
+
+    def __post_init__(self) -> None:
+        if self.exact is not None and not callable(self.exact):
+            raise TypeError(f"`exact` must be a function of the time; got {type(self.exact).__name__}.")
+        if self.dt is not None and not (real_number(self.dt) and 0 < self.dt < 1e100):
+            raise ValueError(f"`dt` must be positive and finite; got {self.dt!r}.")
+        try:
+            t0, t1 = (float(t) for t in self.t_span)
+        except (TypeError, ValueError, OverflowError):
+            t0 = t1 = math.nan
+        if not math.isfinite(t1 - t0):
+            raise ValueError(f"`t_span` must be two finite numbers, start and end; got {self.t_span!r}.")
+        scale = self.energy_scale
+        if scale is not None and not (real_number(scale) and 0 < scale <= sys.float_info.max):
+            raise ValueError(f"`energy_scale` must be positive and finite; got {scale!r}.")
+        if self.domain is not None and not isinstance(self.domain, Domain):
+            kind = type(self.domain).__name__
+            raise TypeError(f"`domain` must be a domain such as sympflow.Box(low, high); got {kind}.")
+        object.__setattr__(self, "t_span", (t0, t1))
+        object.__setattr__(self, "dt", None if self.dt is None else float(self.dt))
+
+    @classmethod
+    def given(cls, options: Mapping[str, Any], **defaults: Any) -> Scene:
+        """Return the scene of the options of a constructor, over its defaults."""
+        options = {name: value for name, value in options.items() if name != "time" or value is not None}
+        known = [field.name for field in dataclass_fields(cls)]
+        if "time" in options:
+            raise TypeError(
+                "`time` is for systems that are written out, and those by one piece do not depend on it: leave it out, "
+                "or write H out by HamiltonianSystem.from_sympy(..., time='t')."
+            )
+        for name in options:
+            if name not in known:
+                instead = f": {MEANT[name]}" if name in MEANT else ""
+                raise TypeError(
+                    f"`{name}` is not an argument of this system, nor of its scene, {', '.join(known)}{instead}."
+                )
+        return cls(**{**defaults, **options})
+
+    def state(self, ndof: int) -> np.ndarray | None:
+        """Return y0, checked to be a state of so many degrees of freedom: a copy of floats."""
+        if self.y0 is None:
+            return None
+        try:
+            state = floats("y0", self.y0)
+        except OverflowError:
+            raise ValueError("`y0` must be finite: it has an integer that no float is near.") from None
+        if state.shape != (2 * ndof,):
+            raise ValueError(f"`y0` must have shape ({2 * ndof},), [q, p]; got {state.shape}.")
+        return state
 
 
 class Parameters(dict[str, Any]):
@@ -150,7 +238,6 @@ class HamiltonianSystem(Hamiltonian, Answering):
         **dict.fromkeys(("grad", "jac"), "`gradient(y)`, or `hessian(y)`"),
         "parameters": "`params`",
     }
-
     _period: float | None = None
     _former_period: float | None = None
     _continuous = True  # False of systems that are made of others, whose H may jump where solutions do not feel it
@@ -250,7 +337,7 @@ class HamiltonianSystem(Hamiltonian, Answering):
             warn(
                 f"`expression` has {symbols.ndof} coordinates: written out, H takes seconds to define, and a step ten "
                 "times as long as by HamiltonianSystem.lattice, from one site and one bond, or by "
-                "HamiltonianSystem.pairs, from one pair. Use one of these.",
+                "HamiltonianSystem.pairs, from one pair. Use one of these."
             )
         self = cls.__new__(cls)
         M = symbols.inverse_mass
@@ -509,8 +596,7 @@ class HamiltonianSystem(Hamiltonian, Answering):
 
         if isinstance(domain, LatticeStates):
             return domain
-        states = self.y0 if domain is None else domain.sample(DRAWN)
-        assert states is not None
+        states: Any = self.y0 if domain is None else domain.sample(DRAWN)
         return LatticeStates.of_states(self, states)
 
     @cached_property
@@ -678,14 +764,9 @@ class HamiltonianSystem(Hamiltonian, Answering):
         return self._params
 
     def check_parameters(self, names: Iterable[str]) -> None:
-        """Refuse names other than those of the parameters of H.
+        """Refuse names other than those of the parameters of H, by a ValueError with these.
 
-        Raises
-        ------
-        TypeError
-            If the system is given by functions, or a parameter is an array of a lattice's sites.
-        ValueError
-            With the names that it has.
+        A TypeError if the system is given by functions, or a parameter is an array of a lattice's sites.
         """
         if self.local is not None:
             self.local.check_numbers(names)
@@ -732,7 +813,6 @@ class HamiltonianSystem(Hamiltonian, Answering):
         if self.local is not None:
             return HamiltonianSystem._of_local(self.local.with_params(values), self.damping, self.scene)
         self.check_parameters(values)
-        assert self.symbols is not None
         H, time = self.symbols.written[0], self.symbols.named_time
         params = {**self.params, **values}
         made = HamiltonianSystem.from_sympy(H, params=params, time=time, damping=self.damping, **vars(self.scene))
@@ -829,10 +909,7 @@ class HamiltonianSystem(Hamiltonian, Answering):
     def linear_part(self) -> LinearPart:
         """The quadratic part of H: K, its frequencies, the remaining potential U, and the `stiffness`.
 
-        Raises
-        ------
-        ValueError
-            If there is no such part, or its stiff direction turns.
+        A ValueError if there is no such part, or its stiff direction turns.
         """
         from sympflow.hamiltonian.linear_part import linear_part
 
@@ -872,7 +949,7 @@ class HamiltonianSystem(Hamiltonian, Answering):
         if 0 < len(H) <= TYPESET:
             import sympy
 
-            formula = "H = " + sympy.latex(self.symbols.H)  # type: ignore[union-attr]
+            formula = "H = " + sympy.latex(self.symbols.H)
         facts = {
             "H": "" if formula else H,
             "parameters": parameters_text(self.params, GREEK, " = "),

@@ -28,14 +28,7 @@ class WaveFunctionHamiltonian(LocalHamiltonian):
     inverse_mass = None
     instead = "a method with the exact linear flow, such as 'impulse' or 'linear_kahan_li6'"
 
-    def __init__(
-        self,
-        onsite: str | sp.Expr | None,
-        dispersion: str | sp.Expr,
-        shape: Any,
-        length: Any,
-        params: Mapping[str, Any] | None,
-    ) -> None:
+    def __init__(self, onsite: Any, dispersion: Any, shape: Any, length: Any, params: Any) -> None:
         self.grid = checked_shape(shape)
         self.ndof = math.prod(self.grid)
         check_memory(float(self.ndof), "`shape`")

@@ -11,24 +11,10 @@ from typing import Any, ClassVar
 import numpy as np
 
 from sympflow.arguments import check_dt
-from sympflow.arrays import (
-    Array,
-    beside,
-    is_tensor,
-    library_name,
-    stack,
-)
+from sympflow.arrays import Array, beside, is_tensor, library_name, stack
 from sympflow.events import EventSearch
 from sympflow.hamiltonian.system import HamiltonianSystem, counting_view
-from sympflow.integrators.contract import (
-    ENDED,
-    Failure,
-    Integrator,
-    Interrupted,
-    Outcome,
-    Problem,
-    Steps,
-)
+from sympflow.integrators.contract import ENDED, Failure, Integrator, Interrupted, Outcome, Problem, Steps
 from sympflow.integrators.grid import Grid
 from sympflow.integrators.grid_runs import grid_run
 from sympflow.integrators.impulses import pieces_of
@@ -50,7 +36,6 @@ class FixedStep(Integrator):
     """
 
     dt: float | None = None
-
     finds_events: ClassVar[bool] = True
     on_grid: ClassVar[bool] = True
     follows: ClassVar[bool] = False

@@ -40,7 +40,6 @@ ENOUGH, MOST = 0.2, 0.7  # of the tolerance: errors with which a step is taken
 NEAR_POLE = tuple(10.0**-k for k in range(1, 7))
 LOGARITHMIC = 0.9  # ratio of differences of V at these distances from a pole, at least: of a logarithm 1
 NEWTON_STEPS, MOST_CENTERS = 8, 12  # of places that are looked for, and coordinates of the motion
-
 Candidate = tuple[str, str]  # the name of a method, and why it is chosen
 CHOSEN_WITH = {"wisdom_holman": {"corrector": 17}}  # options of methods that are chosen
 RTOL = 1e-9  # of an adaptive method that is chosen
@@ -113,10 +112,7 @@ def _flow_holds(system: HamiltonianSystem, y0: Array, tol: float | None) -> bool
 
 @lately_kept
 def _attractive_pole(system: HamiltonianSystem, states: bytes) -> tuple[str, bool]:
-    """A place towards which V falls without bound from all positions, in words; True if like a power where V < 0.
-
-    Such places are q = 0 and those where an expression of H vanishes that is next to them.
-    """
+    """A place towards which V falls without bound from all positions, in words; True if like a power where V < 0."""
     if not system.definition.poles or (system.local is not None and system.written is None):
         return "", False
     q = np.frombuffer(states).reshape(-1, 2 * system.ndof)[:, : system.ndof]
@@ -134,7 +130,6 @@ def _centers(system: HamiltonianSystem, q: np.ndarray) -> Iterator[tuple[str, np
     """Names and positions (n, d) of the zeros that are next to positions q of what vanishes where H is infinite."""
     yield "q = 0" if system.local is None else "r = 0", np.zeros_like(q)
     poles, d = system.definition.poles, system.ndof
-    assert poles is not None
 
     def sizes(x: np.ndarray) -> np.ndarray:
         return poles.sizes(np.concatenate([x, 0 * x], axis=-1), np.zeros(x.shape[:-1]))

@@ -257,8 +257,11 @@ class KineticPotential(Composition):
                     products = system.hessian_vector(q[..., None, :], U.swapaxes(-1, -2), at).swapaxes(-1, -2)
                 change = (c * h)[..., None] * products
                 if substep.three:
-                    G = (substep.three * h**3)[..., None] * _force_gradient_jvp(system, q, U, at)
-                    change = change + G
+                    x, along = q[..., None, :], U.swapaxes(-1, -2)
+                    v = system.velocity(system.force(q, at))[..., None, :]
+                    G = system.third_derivative(x, v + 0 * along, along, at)
+                    G = G - system.hessian_vector(x, system.velocity(system.hessian_vector(x, along, at)), at)
+                    change = change + (substep.three * h**3)[..., None] * G.swapaxes(-1, -2)
                 P = P - change
                 p = p + _kick(system, q, substep, h, self.scheme.monomials, at)
         return np.concatenate([q, p], axis=-1), np.concatenate([U, P], axis=-2)
@@ -306,14 +309,6 @@ def _velocities(system: HamiltonianSystem, p: Array, P: np.ndarray) -> np.ndarra
     if not system.quadratic_kinetic:
         return system.kinetic_hessian(p) @ P
     return system.velocity(P.swapaxes(-1, -2)).swapaxes(-1, -2)
-
-
-def _force_gradient_jvp(system: HamiltonianSystem, q: Array, U: np.ndarray, t: Any = None) -> np.ndarray:
-    """The derivatives along vectors (..., d, k) of the force gradient's ∇²V·M⁻¹F, F = −∇V; of a system by one piece."""
-    x, along = q[..., None, :], U.swapaxes(-1, -2)
-    v = system.velocity(system.force(q, t))[..., None, :]
-    turned = system.hessian_vector(x, system.velocity(system.hessian_vector(x, along, t)), t)
-    return (system.third_derivative(x, v + 0 * along, along, t) - turned).swapaxes(-1, -2)
 
 
 # exact flows of parts ------------------------------------------------------------------------------
@@ -448,7 +443,6 @@ class MollifiedLinearRest(LinearRest):
     label = "mollified"
 
     def filters(self, h: Any) -> Any:
-        assert self.parts.linear is not None
         for part in self.parts.rest:
             if part.turns:
                 raise ValueError(
@@ -467,7 +461,6 @@ class MidpointLinearRest(LinearRest):
 
     def times(self, s: Any) -> Any:
         parts = self.parts
-        assert parts.linear is not None
         times = _each_class(s, parts)
         kinds = [parts.linear.kinds[j] for j in parts.linear.representatives]
         rates = like(parts.linear.rates[parts.linear.representatives], times)
@@ -529,7 +522,7 @@ class SolvableParts(ExactMaps):
 
 
 class TwoCopies(SolvableParts):
-    """Strang steps over H(q, y), H(x, p) and the coupling of two copies of phase space, for any H: see `copies`."""
+    """Strang steps over H(q, y), H(x, p) and the coupling of two copies of phase space, for any H: see `two_copies`."""
 
     label = "copies"
     keeps = "the second copy of phase space"
@@ -539,23 +532,23 @@ class TwoCopies(SolvableParts):
         super().__init__(method, scheme, system)
 
     def _parts(self, system: HamiltonianSystem, parts: Any) -> ExactParts:
-        from sympflow.hamiltonian.copies import two_copies
+        from sympflow.hamiltonian.parts import two_copies
 
         return two_copies(system, self.omega)
 
     def lift(self, y: Array) -> Array:
-        from sympflow.hamiltonian.copies import both
+        from sympflow.hamiltonian.parts import both
 
         return both(y, self.ndof)
 
     def project(self, x: Array) -> Array:
-        from sympflow.hamiltonian.copies import mean
+        from sympflow.hamiltonian.parts import mean
 
         return mean(x, self.ndof)
 
     def distance(self, x: Array) -> Array:
         """The largest difference of the copies, and the size of their states: (..., 4d) to (..., 2)."""
-        from sympflow.hamiltonian.copies import distance
+        from sympflow.hamiltonian.parts import distance
 
         return distance(x, self.scale)
 

@@ -58,14 +58,10 @@ if TYPE_CHECKING:
 M = TypeVar("M", bound="Integrator")
 Steps = Iterator[tuple[np.ndarray, Array, np.ndarray]]
 """Chunks of executed steps: times (n,), states at their beginnings (n, ..., 2d), signed lengths (n,) or (n, ...)."""
-
 MOST_ENTRIES = 20_000_000
 """Entries of the Jacobians that are held at a time."""
-
 FINISHED = "The solver successfully reached the end of the integration interval."
 ENDED = "A termination event occurred."
-
-
 INTERRUPTED = "The run was interrupted after t = {t:.15g}; what was computed until then is kept."
 
 
@@ -103,10 +99,7 @@ class Failure(Enum):
         "the star",
         "Follow the encounter with the splitting 'kinetic', such as method 'dop853' or 'srkn11b' with short steps",
     )
-    STALLED = (
-        "After {n_steps} steps time hardly advances any more, as before a collision",
-        "Raise `dt`",
-    )
+    STALLED = ("After {n_steps} steps time hardly advances any more, as before a collision", "Raise `dt`")
 
 
 class Interrupted(KeyboardInterrupt):
@@ -198,9 +191,10 @@ class Integrator:
     """Name of what a run keeps from step to step beside the state y, so that `step` from y alone does not know it."""
 
     @classmethod
+    @cache
     def options(cls) -> tuple[str, ...]:
         """The names of the options that this method takes."""
-        return _field_names(cls)  # type: ignore[arg-type]
+        return tuple(f.name for f in fields(cls))  # type: ignore[arg-type]
 
     @property
     def label(self) -> str:
@@ -387,27 +381,14 @@ def forward_tangent(
 
 
 def differentiated(
-    jacobian: Callable[[Any, np.ndarray, np.ndarray], np.ndarray],
-    times: np.ndarray,
-    states: Array,
-    lengths: np.ndarray,
+    jacobian: Callable[[Any, np.ndarray, np.ndarray], np.ndarray], times: np.ndarray, states: Array, lengths: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A chunk of `steps` as times and lengths (n, ...) and Jacobians (n, ..., k, k).
-
-    `jacobian` is given the times (n, ...), the states and the lengths. Each step is differentiated in the precision in
-    which it was executed, so its Jacobian holds the rounding of that precision; it is returned as float64, in which
-    everything that follows is computed.
-    """
+    """A chunk of `steps` as times and lengths (n, ...) and Jacobians (n, ..., k, k)."""
     y = to_numpy(states)
     batch = y.shape[:-1]
     t, h = (np.broadcast_to(x.reshape(*x.shape, *[1] * (len(batch) - x.ndim)), batch) for x in (times, lengths))
     with np.errstate(all="ignore"):
         return t, h, jacobian(t, y, h.astype(y.dtype)).astype(float)
-
-
-@cache
-def _field_names(cls: type) -> tuple[str, ...]:
-    return tuple(f.name for f in fields(cls))
 
 
 def method_class(base: type[M], class_name: str, module: str, kind: type[type] = type, **own: Any) -> type[M]:

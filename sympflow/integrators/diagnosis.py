@@ -4,22 +4,24 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cache, partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 from weakref import WeakSet
 
 import numpy as np
 
 from sympflow.arguments import warn
-from sympflow.arrays import Array, is_tensor, masked, readable, to_numpy
+from sympflow.arrays import Array, finite_states, has_values, is_tensor, masked, one_lane, readable, to_numpy
+from sympflow.hamiltonian.domain import Box, Domain, EnergySublevel
 from sympflow.hamiltonian.scales import rate_of_motion
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep
 from sympflow.integrators.contract import Integrator, Outcome, Problem
-from sympflow.integrators.domain_exit import check_domain, check_system_along, warn_of_leap, warn_of_loss
 
 if TYPE_CHECKING:
+    from sympflow.flow.known import KnownFlow
     from sympflow.hamiltonian.parameter_rows import ParameterRows
     from sympflow.hamiltonian.poles import Poles
 
@@ -32,7 +34,6 @@ LOST = 0.01  # of y·∇H: a state whose energy differs by more is no longer on 
 SHORT = 1e-11  # of the way: steps below it go on no more
 NEAR, NEARER, GROWTH = 1e-3, 1e-8, 10.0
 """The state is infinite at the end if it grows by so much from this to that part of the way before it."""
-
 LOOKED_AT, LOOKED_AT_TOGETHER = 32, 4096  # outputs of one trajectory, states of all, at which H and signs are compared
 OFF, FAR_OFF = 0.01, 0.5  # of the kinetic energy: a change of H after which steps are looked at; where H may change
 MOST_WALKED, MOST_TESTED, MOST_NAMED = 4 * 10**6, 32, 64  # numbers of a run executed again; crossings; trajectories
@@ -40,8 +41,6 @@ ACROSS, AROUND, PARTS = 0.25, 8, 9
 """A step leaps if, at one of so many points on it, what vanishes is so small a part of what it is at another; around it
 H changes by more than a tenth of the kinetic energy within so many steps."""
 LOST_AROUND = 0.1
-
-
 TOO_LONG = 0.05  # energy error, over the size of the energy, of a run whose step is too long
 PHASES, PHASE_ERROR = np.geomspace(1e-3, 3.0, 400), 0.01
 """Where energy is not kept, a step is too long if an oscillation is off by so much of a radian, or beyond the last."""
@@ -51,6 +50,9 @@ SAFE = 4  # steps of so many `dt` of a system are not looked at in a run of few
 FEWEST_NEAR, LOST_DIGITS = 100, 1e-9
 """The closest of so many steps, or of all, to a value where terms cancel is that part of the way from it; a force with
 that share of errors there is told."""
+STATES_COMPARED, MOST_COMPARED = 16, 64
+"""Outputs of a run, and states of a batch, at which H is compared with that of the flow."""
+MANY_TIMES = 1000.0  # times the certified energy error of a flow beyond which an error outside its domain is warned of
 _TOLD: WeakSet[Any] = WeakSet()
 
 
@@ -78,11 +80,7 @@ def diagnose(
     action: str,
     interrupted: bool,
 ) -> None:
-    """Look at the outcome of a run: what it shows ends it, is added to its message, or is warned of.
-
-    These are poles that it passed, terms of H that cancel, when the solution becomes infinite, singularities over which
-    it leapt, functions that do not fit, a flow of another system, its domain, and steps that are too long.
-    """
+    """Look at the outcome of a run: what it shows ends it, is added to its message, or is warned of."""
     system, y0 = problem.system, problem.y0
     if not interrupted:
         diagnose_piece(outcome, integrator, problem, rows)
@@ -121,7 +119,6 @@ def note_poles(outcome: Outcome, integrator: Integrator, problem: Problem, value
     poles, width, n = problem.system.definition.poles, 2 * problem.system.ndof, len(outcome.t)
     numbers: Sequence[Any] = ()
     if problem.parameter_values is not None:
-        assert problem.system.symbols is not None
         poles, numbers = problem.system.symbols.parametric.poles, [*problem.parameter_values]
     if poles is None or not poles.watched or not n:
         return False
@@ -313,14 +310,7 @@ def _end(
 
 
 def warn_of_long_steps(outcome: Outcome, integrator: Integrator, problem: Problem) -> None:
-    """Warn of what a method doubts, and of fixed steps with which the energy is off by `TOO_LONG` of its size.
-
-    Where energy is not kept, the motion at the start and the end must not be too fast for the step.
-
-    H is evaluated at the start and a few outputs, of large systems at one for every 200 steps, and not in runs of few
-    steps that are not long, which would take twice the time. Its size is the largest of ½ Σ|y_i ∂H/∂y_i| there, that
-    of an oscillator.
-    """
+    """Warn of what a method doubts, and of fixed steps with which the energy is off by `TOO_LONG` of its size."""
     if not isinstance(integrator, FixedStep):
         return
     system, n, n_steps = problem.system, len(outcome.t), outcome.stats.get("n_steps", 0)
@@ -563,3 +553,166 @@ def note_singularities_of_rows(sol: Any, integrator: Integrator, problem: Proble
         sol.stats["blow_up_time"] = times
         first = int(np.argmax(np.isfinite(times)))
         sol.message += f" A solution itself becomes infinite, at about t = {times[first]:.10g}: end `t_span` before."
+
+
+# trained flows and leaps ----------------------------------------------------------------------
+
+
+def _surely_within(flow: KnownFlow | None, system: HamiltonianSystem, y: np.ndarray, slack: float) -> bool:
+    """True if all states y (..., 2d) are in the domain of the flow and compiled code can tell."""
+    domain = (None if flow is None else flow.domain) or system.domain
+    if type(domain) is not EnergySublevel and type(domain) is not Box:
+        return False
+    return _compiled()(system, domain, y, slack)
+
+
+@cache
+def _compiled() -> Callable[..., bool]:
+    from sympflow.kernels.passes import all_within
+
+    return all_within
+
+
+def _domain(flow: KnownFlow | None, system: HamiltonianSystem) -> Domain | None:
+    return system.domain if flow is None else flow.domain_for(system)
+
+
+def check_system_along(outcome: Outcome, integrator: Integrator, system: HamiltonianSystem, y0: Array) -> None:
+    """A trained flow must have run on its own system: H is compared at the start and at a few states of the run."""
+    identity = integrator.identity_for(system)
+    if identity is None or identity.is_proved(system):
+        return
+    if not has_values(outcome.y):
+        return
+    width = 2 * system.ndof
+    y = one_lane(outcome.y)
+    chosen = y[np.linspace(0, len(y) - 1, min(len(y), STATES_COMPARED)).astype(int)].reshape(-1, width)
+    starts = one_lane(y0).reshape(-1, width)
+    rows = [states[:: max(1, len(states) // MOST_COMPARED)] for states in (starts, chosen)]
+    states = np.concatenate(rows).astype(float)
+    states = states[np.isfinite(states).all(-1)]
+    first = identity.first_difference(system, states)
+    if first is None:
+        return
+    shown = ", ".join(f"{x:.6g}" for x in states[first][:8]) + (", …" if width > 8 else "")
+    raise ValueError(
+        f"`system` {system.name!r} is not the one that the flow was trained for: at the state ({shown}) of this run "
+        "its H is another. Pass the flow of this system, or train one with sympflow.train(system)."
+    )
+
+
+def warn_of_leap(outcome: Outcome, system: HamiltonianSystem, y0: Array) -> bool:
+    """Warn, and return True, of a run that leapt over a singularity of V, and goes on with any energy."""
+    n, width = len(outcome.t), 2 * system.ndof
+    if not n:
+        return False
+    starts, outputs = to_numpy(y0).reshape(-1, width), to_numpy(outcome.y).reshape(n, -1, width)
+    n_steps = outcome.stats.get("n_steps", 0)
+    leapt_of = partial(system.definition.leapt, n_steps=n_steps, conserves=system.keeps_energy)
+    leapt = leapt_of(starts, outputs[-1])
+    if not leapt.any():
+        return False
+    row = int(np.argmax(leapt))
+    start, along = starts[row], outputs[:, row]
+    first = int(np.argmax(leapt_of(np.broadcast_to(start, along.shape), along)))
+    with np.errstate(all="ignore"):
+        H0, H = system.hamiltonian(np.stack([start, along[-1]]))
+    after = f"between t = {outcome.t[first - 1]:.10g} and {outcome.t[first]:.10g}" if first else "by the first output"
+    which = "" if len(leapt) == 1 else f" of trajectory {row}, the first of {leapt.sum()},"
+    warn(
+        f"The energy{which} went from {H0:.6g} to {H:.6g} over a singularity of V, and the run means nothing after "
+        f"that. It was lost {after}, where {system.definition.leap(along[first], start)}.",
+        RuntimeWarning,
+    )
+    return True
+
+
+def warn_of_loss(outcome: Outcome, integrator: Integrator, system: HamiltonianSystem, y0: Array) -> None:
+    """Warn of a run that left the domain of its flow and lost far more energy than the flow does inside."""
+    flow = integrator.known_flow(system)
+    certificate = None if flow is None else flow.certified
+    if certificate is None or "domain_exit" not in outcome.stats or not system.keeps_energy:
+        return
+    width = 2 * system.ndof
+    with np.errstate(all="ignore"):
+        H0, H = (system.hamiltonian(to_numpy(y).reshape(-1, width)) for y in (y0, outcome.y[-1]))
+        error = np.abs(H - H0) / (system.energy_scale or np.maximum(np.abs(H0), np.abs(H)))
+    held = certificate.relative_limit or certificate.relative_energy_error.largest
+    off = error > MANY_TIMES * held
+    if not off.any():
+        return
+    row = int(np.argmax(np.where(off, error, 0)))
+    which = "" if len(off) == 1 else f" of trajectory {row}, the worst of {off.sum()} such,"
+    warn(
+        f"The state left the domain of the flow at t = {outcome.stats['domain_exit']:.10g}, and the relative energy "
+        f"error{which} is {error[row]:.2g} at t = {outcome.t[-1]:.10g}: the flow is certified for {held:.2g} inside. "
+        "Start inside its `domain`, train a flow on one that holds these states, or take a scheme such as 'srkn11b'.",
+        RuntimeWarning,
+    )
+
+
+def check_start(flow: KnownFlow, system: HamiltonianSystem, y0: Array, compiled: bool) -> None:
+    """A flow that is taken for its accuracy must start where its accuracy was measured."""
+    if compiled and _surely_within(flow, system, y0, 0.0):
+        return
+    domain = _domain(flow, system)
+    if domain is None:
+        return
+    if not readable(y0):
+        raise ValueError(
+            "`tol` needs the values of y0, to see that it is in the domain of the flow, and torch.func.vmap and "
+            "torch.compile hide them: pass the flow itself, as `flow`."
+        )
+    inside = np.asarray(domain.contains(y0))
+    if not inside.all():
+        which = f" (trajectory {', '.join(map(str, np.argwhere(~inside)[0].tolist()))})" if inside.ndim else ""
+        raise ValueError(
+            f"`y0` is outside the domain{which} that the flow with Δt = {flow.dt:g} was trained and measured on, so it "
+            "has no known accuracy to meet `tol` there: start inside, or train a flow there and pass flow=flow."
+        )
+
+
+def check_domain(outcome: Outcome, integrator: Integrator, system: HamiltonianSystem, action: str) -> None:
+    """Note the first output outside the domain, or end the run there."""
+    flow = integrator.known_flow(system)
+    slack = 0.0 if flow is None else float(flow.figures.get("energy_error_max") or 0.0)
+    if outcome.stats.get("backend") == "compiled" and _surely_within(flow, system, outcome.y, slack):
+        return
+    domain = _domain(flow, system)
+    if domain is None or not len(outcome.t):
+        return
+    inside = np.asarray(domain.contains(outcome.y, slack=slack))  # (n, ...)
+    if inside.all():
+        return
+    with np.errstate(invalid="ignore"):
+        inside = inside | ~finite_states(outcome.y)  # what has become non-finite is reported as that
+    if inside.all():
+        return
+    first = int(np.argmin(inside.reshape(len(inside), -1).all(1)))
+    t = float(outcome.t[first])
+    outcome.stats["domain_exit"] = t
+    which = ""
+    if inside.ndim > 1:
+        index = tuple(np.argwhere(~inside[first])[0].tolist())
+        count = int((~inside).any(0).sum())
+        which = f" (trajectory {', '.join(map(str, index))}, the first of {count})"
+    note = f"The state left the domain at t = {t:.15g}{which}"
+    if action == "warn":
+        worth = ""
+        if flow is not None and not any(flow.evaluations(1, 1, 0, "array").values()):  # else forces of the system
+            worth = (
+                ", where its network was not trained: it stays finite, even past a singularity, and what it gives from "
+                "that time on means nothing. Start inside the domain, or use a classical method"
+            )
+        held = "the figures" if flow is None or flow.certified is None else "the figures and the certificate"
+        outcome.message += f" {note}: {held} of a trained flow do not hold there{worth}."
+        return
+    outcome.message = f"{note}. Start inside the domain, or pass on_domain_exit='warn'."
+    if inside.ndim == 1:
+        outcome.t, outcome.y = outcome.t[: first + 1], outcome.y[: first + 1]
+        outcome.status = -1
+        return
+    outside = np.logical_or.accumulate(~inside, axis=0)
+    after = np.concatenate([np.zeros_like(outside[:1]), outside[:-1]])  # the exit itself is kept
+    outcome.status = np.where(outside[-1], -1, outcome.status)
+    outcome.y = masked(outcome.y, after[..., None], np.nan)

@@ -28,7 +28,7 @@ from sympflow.integrators.clocks import (
     transformed_system,
 )
 from sympflow.integrators.contract import Failure, Outcome, Problem, Steps
-from sympflow.integrators.domain_exit import check_start
+from sympflow.integrators.diagnosis import check_start
 from sympflow.integrators.grid_runs import grid_run
 from sympflow.integrators.registry import is_flow
 from sympflow.integrators.steppers import ArraySteps, Stepper, compiled_loops, rollout
@@ -39,7 +39,6 @@ if TYPE_CHECKING:  # and torch, which compiled runs of flows that ship do withou
     from sympflow.flow.flow_map import FlowMap
 
 T = TypeVar("T")
-
 SEARCH, SEARCH_OF_EACH = 60_000, 2_000
 """Forces that take as long as what a run in another time needs besides, and each trajectory in a batch."""
 AT_A_TIME, AT_A_TIME_OF_EACH = 100, 600
@@ -98,7 +97,6 @@ class FlowIntegrator(FixedStep):
     """
 
     flow: Any = field(default=None, repr=False)
-
     order: ClassVar[int | None] = None
     trained: ClassVar[bool] = True
     compiles: ClassVar[bool] = True
@@ -224,7 +222,9 @@ class FlowSteps(ArraySteps):
         import torch
 
         if not is_tensor(y0):
-            inner = _as_tensors(carry)
+            inner = None if carry is None else RunCheckpoint()
+            if carry is not None and carry.running is not None:
+                inner = RunCheckpoint(carry.steps, torch.from_numpy(carry.running))
             with torch.no_grad():
                 whole = torch.from_numpy(np.ascontiguousarray(y0))
                 states, finite = self.rollout(whole, h, n_steps, save, t0, inner)
@@ -254,15 +254,6 @@ class FlowSteps(ArraySteps):
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
         return self.flow.evaluations(n_steps, n_saved, n_extra, backend)
-
-
-def _as_tensors(carry: RunCheckpoint | None) -> RunCheckpoint | None:
-    """A carry of arrays as one of tensors."""
-    if carry is None or carry.running is None:
-        return None if carry is None else RunCheckpoint()
-    import torch
-
-    return RunCheckpoint(carry.steps, torch.from_numpy(carry.running))
 
 
 def _apply(function: Any, y: Array, h: float | Array, t: Any) -> Array:
@@ -302,7 +293,6 @@ class SympFlowIntegrator(FlowIntegrator):
 
     tol: float | None = None
     compensated: bool = False
-
     name: ClassVar[str] = "sympflow"
     source: ClassVar[str] = "A trained SympFlow: symplectic for every step length, with an exact inverse."
     symplectic: ClassVar[bool] = True
@@ -331,7 +321,12 @@ class SympFlowIntegrator(FlowIntegrator):
     def resolved(self, system: HamiltonianSystem, y0: Array, length: float, n_times: int = 0) -> FixedStep:
         """Return the integrator that runs: with `tol`, over a `length` that is worth it, a flow in another time."""
         if self.flow is not None:
-            return self._given_in_another_time(system)
+            origin = self.flow.origin
+            if origin is None or not origin.is_of(system):
+                return self
+            if self.compensated:
+                raise ValueError("`compensated` sums are not for a flow in another time: leave it out.")
+            return LogSympFlow(flow=self.flow, shift=origin.shift, dt=self.dt)
         if self.tol is None or self.compensated or y0.dtype != np.float64:
             return self
         name, tol = self.name, self.tol
@@ -345,14 +340,6 @@ class SympFlowIntegrator(FlowIntegrator):
             return self
         check_start(flow, system, y0, False)
         return LogSympFlow(flow=flow, shift=shift)
-
-    def _given_in_another_time(self, system: HamiltonianSystem) -> FixedStep:
-        origin = self.flow.origin
-        if origin is None or not origin.is_of(system):
-            return self
-        if self.compensated:
-            raise ValueError("`compensated` sums are not for a flow in another time: leave it out.")
-        return LogSympFlow(flow=self.flow, shift=origin.shift, dt=self.dt)
 
     def kernel(self, flow: KnownFlow, problem: Problem) -> Any:
         if not self.compensated:
@@ -427,7 +414,6 @@ class LogSympFlow(FixedStep):
 
     shift: float | None = None
     flow: Any = field(default=None, repr=False)
-
     name: ClassVar[str] = "log_sympflow"
     order: ClassVar[int | None] = None
     symplectic: ClassVar[bool] = True

@@ -13,9 +13,9 @@ MOST_OPEN_STEPS = 1_000_000
 """A run whose interval has no end is ended after so many: an event that never comes would be waited for, for ever."""
 
 
-def open_end(t0: float, t1: float, dt: float, most: int = MOST_OPEN_STEPS) -> float:
+def open_end(t0: float, t1: float, dt: float) -> float:
     """Return t1, or for an infinite one the end of `most` steps of length dt."""
-    return t1 if math.isfinite(t1) else t0 + math.copysign(most * dt, t1)
+    return t1 if math.isfinite(t1) else t0 + math.copysign(MOST_OPEN_STEPS * dt, t1)
 
 
 def no_event(n_steps: int, t: float) -> str:
@@ -78,10 +78,7 @@ class Grid:
 
 
 class Outputs:
-    """The outputs of a run by their numbers 0 … n − 1, of which a part is made at a time.
-
-    These are the times of `t_eval`, or those of every `save_every`-th step and the end.
-    """
+    """The outputs of a run by their numbers 0 … n − 1, of which a part is made at a time."""
 
     def __init__(self, grid: Grid, t_eval: np.ndarray | None, save_every: int) -> None:
         self.grid, self.t_eval, self.every = grid, t_eval, save_every

@@ -28,16 +28,7 @@ from sympflow.arrays import (
     unfollowed,
 )
 from sympflow.events import EventSearch
-from sympflow.integrators.contract import (
-    ENDED,
-    FINISHED,
-    INTERRUPTED,
-    Failure,
-    Outcome,
-    Problem,
-    finished,
-    interrupted,
-)
+from sympflow.integrators.contract import ENDED, FINISHED, INTERRUPTED, Failure, Outcome, Problem, finished, interrupted
 from sympflow.integrators.grid import Grid, Outputs, distinct
 from sympflow.integrators.interpolants import DenseOutput
 from sympflow.integrators.steppers import Stepper, shorter_steps
@@ -262,8 +253,8 @@ class GridSolution(DenseOutput):
 class Pace:
     """The lengths of windows, by the time that the last one took."""
 
-    def __init__(self, first: int, seconds: float = SECONDS) -> None:
-        self.n, self.seconds = first, seconds
+    def __init__(self, first: int) -> None:
+        self.n = first
         self.started = time.perf_counter()
 
     def steps(self, left: int) -> int:
@@ -274,7 +265,7 @@ class Pace:
     def took(self, n: int) -> None:
         """Note that the window, of n steps, has ended."""
         elapsed = time.perf_counter() - self.started
-        self.n = max(1, min(GROWTH * n, int(n * self.seconds / elapsed) if elapsed > 0 else GROWTH * n))
+        self.n = max(1, min(GROWTH * n, int(n * SECONDS / elapsed) if elapsed > 0 else GROWTH * n))
 
 
 # outputs in memory ----------------------------------------------------------------------------------------------------

@@ -15,42 +15,45 @@ from sympflow.arrays import Array, beside, detached, last, like, moveaxis, stack
 Time = Any  # a number, or a tensor that carries a gradient
 
 
-class Interpolant:
-    """One step from t0 to t1: the polynomial Σ_j c_j x^j in x = (t − t0)/(t1 − t0)."""
+def _basis(states: Sequence[float], slopes: Sequence[float]) -> np.ndarray:
+    """The polynomials, in columns, that are 1 in one of the values at these places in a step and 0 in all others."""
+    powers = np.arange(len(states) + len(slopes))
+    x, z = np.array(states)[:, None], np.array(slopes)[:, None]
+    rows = np.concatenate([x**powers, powers * z ** (powers - 1).clip(0)])
+    return np.round(4 * np.linalg.inv(rows)) / 4  # exact
 
-    def __init__(self, begin: Time, end: Time, coefficients: Sequence[Array]) -> None:
-        self.begin, self.end, self.coefficients = begin, end, coefficients
+
+THIRDS = (1 / 3, 2 / 3)
+_BASES = {
+    (2, 2): _basis((0, 1), (0, 1)),
+    (3, 2): _basis((0, 1, 1 / 2), (0, 1)),
+    (4, 4): _basis((0, 1, *THIRDS), (0, 1, *THIRDS)),
+}
+
+
+class Interpolant:
+    """One step from t0 to t1, between them a polynomial through states and slopes, taken when they are needed.
+
+    Of `values` these are (states, slopes): at both ends; of states at the middle too, or of both at the thirds.
+    """
+
+    def __init__(
+        self, begin: Time, end: Time, y0: Array, values: Callable[[], tuple[Sequence[Array], Sequence[Array]]]
+    ) -> None:
+        self.begin, self.end, self.y0, self._values = begin, end, y0, values
         self.t0, self.t1 = (float(detached(t)) for t in (begin, end))
 
-    @property
-    def y0(self) -> Array:
-        """The state at the beginning."""
-        return self.coefficients[0]
+    @cached_property
+    def values(self) -> tuple[np.ndarray, list[Array]]:
+        """The polynomials of the values, and these."""
+        states, slopes = self._values()
+        h = self.end - self.begin
+        return _BASES[len(states), len(slopes)], [*states, *(h * f for f in slopes)]
 
     def __call__(self, t: float) -> Array:
-        return _horner(self.coefficients, (float(t) - self.begin) / (self.end - self.begin))
-
-
-def quartic(t0: Time, t1: Time, y0: Array, y1: Array, middle: Array, f0: Array, f1: Array) -> Interpolant:
-    """The polynomial of degree 4 with these states at the beginning, end and middle, and slopes at both ends."""
-    h = t1 - t0
-    return Interpolant(
-        t0,
-        t1,
-        [
-            y0,
-            h * f0,
-            h * (f1 - 4 * f0) - 11 * y0 - 5 * y1 + 16 * middle,
-            h * (5 * f0 - 3 * f1) + 18 * y0 + 14 * y1 - 32 * middle,
-            2 * h * (f1 - f0) - 8 * (y0 + y1) + 16 * middle,
-        ],
-    )
-
-
-def hermite(t0: Time, t1: Time, y0: Array, y1: Array, f0: Array, f1: Array) -> Interpolant:
-    """The cubic with these states and slopes at both ends."""
-    h, rise = t1 - t0, y1 - y0
-    return Interpolant(t0, t1, [y0, h * f0, 3 * rise - h * (2 * f0 + f1), h * (f0 + f1) - 2 * rise])
+        basis, values = self.values
+        x = (float(t) - self.begin) / (self.end - self.begin)
+        return _sum(_weights(basis, x), values)
 
 
 class DenseOutput:
@@ -97,19 +100,20 @@ class Piecewise(DenseOutput):
         return np.array([step.t1 for step in self.steps])
 
     @cached_property
-    def _stacked(self) -> tuple[Any, Any, list[Array]]:
-        """Beginnings, lengths and coefficients of each power of all steps: (m,), (m,), each (m, ..., 2d)."""
+    def _stacked(self) -> tuple[Any, Any, np.ndarray, list[Array]]:
+        """Beginnings and lengths of all steps (m,), the polynomials of their values, and these, each (m, ..., 2d)."""
         begin, length = zip(*((step.begin, step.end - step.begin) for step in self.steps), strict=True)
-        coefficients = [stack(c, axis=0) for c in zip(*(step.coefficients for step in self.steps), strict=True)]
-        return stack(begin, axis=0), stack(length, axis=0), coefficients
+        bases, each = zip(*(step.values for step in self.steps), strict=True)
+        values = [stack(v, axis=0) for v in zip(*each, strict=True)]
+        return stack(begin, axis=0), stack(length, axis=0), bases[0], values
 
     def states(self, times: np.ndarray) -> Array:
         if not self.steps:
             return stack([self.y0] * len(times), axis=0) if times.size else self.y0[None][:0]
-        begin, length, coefficients = self._stacked
+        begin, length, basis, values = self._stacked
         k: Any = np.minimum(np.searchsorted(self.sign * self._ends, self.sign * times), len(self.steps) - 1)
-        x = like((beside(times, begin) - begin[k]) / length[k], self.y0)
-        return _horner([c[k] for c in coefficients], x.reshape(-1, *[1] * self.y0.ndim))
+        x = ((beside(times, begin) - begin[k]) / length[k]).reshape(-1, *[1] * self.y0.ndim)
+        return _sum([like(w, self.y0) for w in _weights(basis, x)], [v[k] for v in values])
 
 
 class Batch(DenseOutput):
@@ -132,8 +136,19 @@ class Batch(DenseOutput):
         return moveaxis(y.reshape(*self.batch, *y.shape[1:]), -1, 0)
 
 
-def _horner(coefficients: Sequence[Array], x: Any) -> Array:
-    y = coefficients[-1]
-    for c in coefficients[-2::-1]:
-        y = y * x + c
-    return y
+def _weights(basis: np.ndarray, x: Any) -> list[Any]:
+    """The values of the polynomials at x."""
+    found = []
+    for column in basis.T.tolist():
+        w: Any = 0.0 * x
+        for c in column[::-1]:
+            w = w * x + c
+        found.append(w)
+    return found
+
+
+def _sum(weights: Sequence[Any], values: Sequence[Array]) -> Array:
+    total = weights[0] * values[0]
+    for w, v in zip(weights[1:], values[1:], strict=True):
+        total = total + w * v
+    return total

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import difflib
 import re
 import sys
 from collections.abc import Callable
 from functools import cache, lru_cache
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from sympflow.arguments import did_you_mean
 from sympflow.arrays import Array
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.contract import Integrator
@@ -21,10 +21,8 @@ if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
 T = TypeVar("T")
-
 GROUP = "sympflow.integrators"
 """The entry-point group in which a distribution announces its integrators: `name = "package.module:Class"`."""
-
 _INSTEAD = {
     "args": "values of parameters are in H, or given by `params`",
     **dict.fromkeys(("q0", "p0", "x0", "v0"), "the initial state is `y0`, [q, p] in one array"),
@@ -117,20 +115,12 @@ def get(method: str | type[Integrator]) -> type[Integrator]:
         return get(name)
     if name in SYNONYMS:
         return get(SYNONYMS[name])
-    raise ValueError(f"`method` {method!r} is unknown. {_instead(name)}{_kinds()}")
-
-
-def _instead(name: str) -> str:
-    """The advice for the name of a method that is not there."""
-    if name in ABSENT:
-        return f"{ABSENT[name]} "
-    close = difflib.get_close_matches(name, [*available(), *SYNONYMS], n=1)
-    return f"Did you mean {close[0]!r}? " if close else ""
-
-
-def _kinds() -> str:
+    instead = f" {ABSENT[name]}" if name in ABSENT else did_you_mean(name, [*available(), *SYNONYMS])
     rows = "".join(f"\n  {kind:42}{', '.join(map(repr, names))}" for kind, names in KINDS.items())
-    return f"There are, among others:{rows}\nAll are listed by sympflow.available()."
+    raise ValueError(
+        f"`method` {method!r} is unknown.{instead} There are, among others:{rows}\n"
+        "All are listed by sympflow.available()."
+    )
 
 
 @cache

@@ -57,7 +57,6 @@ class _Scipy(RungeKutta):
     max_step: float = math.inf
     first_step: float | None = None
     max_steps: int | None = None
-
     solver: ClassVar[Any]
     finds_events: ClassVar[bool] = True
     takes_infinite_end: ClassVar[bool] = True
@@ -149,12 +148,7 @@ class _Scipy(RungeKutta):
     def _run_one(self, problem: Problem, y0: np.ndarray, t_eval: np.ndarray | None) -> Outcome:
         """SciPy's driver loop for one trajectory: every step, or the dense output at `t_eval`."""
         t0, t1 = problem.t0, problem.t1
-        stats: dict[str, Any] = {
-            "n_steps": 0,
-            "force_evaluations": 0,
-            "hessian_evaluations": 0,
-            "backend": "scipy",
-        }
+        stats: dict[str, Any] = {"n_steps": 0, "force_evaluations": 0, "hessian_evaluations": 0, "backend": "scipy"}
         times, states, interpolants = [t0], [y0], []
         solver = self._start(problem.system, t0, t1, y0.astype(float), problem.backend) if t1 != t0 else None
         failure = None

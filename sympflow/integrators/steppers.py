@@ -60,10 +60,7 @@ class ArraySteps:
 
 
 class Stepper:
-    """One run of a fixed-step integrator: all that a run changes or counts is here, its kernel and its arrays.
-
-    `kernel` are its compiled loops, None where it is made of array operations; `arrays` the same steps by these.
-    """
+    """One run of a fixed-step integrator: all that a run changes or counts is here, its kernel and its arrays."""
 
     def __init__(
         self,
@@ -182,9 +179,7 @@ def compiled_loops(
     told: list[str] | None = None,
     system: Any = None,
 ) -> Any:
-    """Return the compiled loops that `make` gives, or None where the call needs, or asks for, array operations.
-    Tensors need these, but where the `system` is given: there those on the CPU are compiled.
-    """
+    """Return the compiled loops that `make` gives, or None where the call needs, or asks for, array operations."""
     reason = None
     if backend == "array":
         reason = "`backend` is 'array': choose 'auto'."

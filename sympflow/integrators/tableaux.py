@@ -12,7 +12,7 @@ Row = tuple[float, ...]
 
 @dataclass(frozen=True)
 class Tableau:
-    """Stages K_i = f(y + h Σ_j A_ij K_j) and the step y + h Σ_i B_i K_i."""
+    """Stages K_i = f(y + h Σ_j A_ij K_j), the step y + h Σ_i B_i K_i, and some have weights of its `middle`."""
 
     A: tuple[Row, ...]
     B: Row
@@ -59,10 +59,6 @@ _DOPRI8_B = (
     14005451 / 335480064, 0, 0, 0, 0, -59238493 / 1068277825, 181606767 / 758867731, 561292985 / 797845732,
     -1041891430 / 1371343529, 760417239 / 1151165299, 118820643 / 751138087, -528747749 / 2220607170, 1 / 4,
 )
-_DOPRI8_MIDDLE = (  # torchdiffeq's interpolation; for "dopri5" Shampine's, Math. Comp. 46 (1986) 135–150
-    0.04103130360739393, 0, 0, 0, 0, 0.05100562801991382, 0.2388930677412202, 0.3096870143996103, -0.2172325471755352,
-    0.07833405679331928, -0.0018614369715579948, 0.007072844202678841, 0.00690847373200576, -0.013838404349047373,
-)
 ADAPTIVE = {
     "dopri5": Tableau(
         ((), (1 / 5,), (3 / 40, 9 / 40), (44 / 45, -56 / 15, 32 / 9),
@@ -70,20 +66,19 @@ ADAPTIVE = {
          (9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656)),
         (35 / 384, 0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84), 5,
         "J. R. Dormand, P. J. Prince, J. Comput. Appl. Math. 6 (1980) 19–26",
-        middle=(6025192743 / 60171106304, 0, 51252292925 / 130801643196, -2691868925 / 90256659456,
+        middle=(  # Shampine's, Math. Comp. 46 (1986) 135–150
+                6025192743 / 60171106304, 0, 51252292925 / 130801643196, -2691868925 / 90256659456,
                 187940372067 / 3189068634112, -1776094331 / 39487288512, 11237099 / 470086768)),
     "dopri8": Tableau(
-        _DOPRI8_A, _DOPRI8_B, 8, "P. J. Prince, J. R. Dormand, J. Comput. Appl. Math. 7 (1981) 67–75",
-        middle=_DOPRI8_MIDDLE),
+        _DOPRI8_A, _DOPRI8_B, 8, "P. J. Prince, J. R. Dormand, J. Comput. Appl. Math. 7 (1981) 67–75"),
     "bosh3": Tableau(
         ((), (1 / 2,), (0.0, 3 / 4)), (2 / 9, 1 / 3, 4 / 9), 3,
-        "P. Bogacki, L. F. Shampine, Appl. Math. Lett. 2 (1989) 321–325", middle=(0.0, 1 / 2, 0.0, 0.0)),
+        "P. Bogacki, L. F. Shampine, Appl. Math. Lett. 2 (1989) 321–325"),
     "fehlberg2": Tableau(
         ((), (1 / 2,), (1 / 256, 255 / 256)), (1 / 512, 255 / 256, 1 / 512), 2,
-        "E. Fehlberg, NASA Technical Report R-315 (1969)", carries_slope=True, middle=(0.0, 1 / 2, 0.0)),
+        "E. Fehlberg, NASA Technical Report R-315 (1969)", carries_slope=True),
     "adaptive_heun": Tableau(
-        ((), (1.0,)), (1 / 2, 1 / 2), 2, "K. Heun, Z. Math. Phys. 45 (1900) 23–38", carries_slope=True,
-        middle=(1 / 2, 0.0)),
+        ((), (1.0,)), (1 / 2, 1 / 2), 2, "K. Heun, Z. Math. Phys. 45 (1900) 23–38", carries_slope=True),
 }
 # fmt: on
 

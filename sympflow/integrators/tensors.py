@@ -13,8 +13,6 @@ from sympflow.arguments import check_not_followed
 from sympflow.arrays import detached, differentiable, to_numpy, transformed
 from sympflow.kernels.protocol import RunCheckpoint, Task
 
-__all__ = ["MovingTimes", "rolled_out", "stepped"]
-
 
 def rolled_out(
     stepper: Any, y0: Tensor, h: float, n_steps: int, save: np.ndarray, t0: float, carry: RunCheckpoint | None
@@ -44,10 +42,7 @@ def stepped(stepper: Any, y: Tensor, h: Any, t: Any) -> Tensor:
 
 
 class MovingTimes:
-    """Times of a run that torch follows: outputs move along the field with them, and starts against it.
-
-    That is the derivative of the solution, and of a step of a method of order p up to O(hᵖ).
-    """
+    """Times of a run that torch follows: outputs move along the field with them, and starts against it."""
 
     def __init__(self, t_span: Any, t_eval: Any) -> None:
         self._ends = (None, None) if t_span is None else tuple(t_span)

@@ -16,16 +16,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from sympflow.arguments import check_dt
-from sympflow.arrays import (
-    Array,
-    differentiable,
-    full_of_nan,
-    is_tensor,
-    readable,
-    stack,
-    to_numpy,
-    transformed,
-)
+from sympflow.arrays import Array, differentiable, full_of_nan, is_tensor, readable, stack, to_numpy, transformed
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep, OwnSteps, Recorder
 from sympflow.integrators.contract import (
@@ -40,7 +31,7 @@ from sympflow.integrators.contract import (
 )
 from sympflow.integrators.grid import Grid
 from sympflow.integrators.impulses import pieces_of
-from sympflow.integrators.interpolants import Batch, Interpolant, Piecewise, hermite, quartic
+from sympflow.integrators.interpolants import THIRDS, Batch, Interpolant, Piecewise
 from sympflow.integrators.runge_kutta import ExplicitStep, RungeKutta, hopeless, weighted
 from sympflow.integrators.steppers import Stepper, stepper_of
 from sympflow.integrators.tableaux import ADAPTIVE, FIXED, MULTISTEP, Tableau
@@ -185,12 +176,8 @@ class Watched(ByVectorField):
         if t0 == t_end:
             record.empty(t0, y0)
         states = record.outputs
-        stats: dict[str, Any] = {
-            "n_steps": trace.n_steps,
-            "force_evaluations": trace.evaluations,
-            "hessian_evaluations": 0,
-            "backend": "torchdiffeq",
-        }
+        stats: dict[str, Any] = dict(zip(COUNTS, (trace.n_steps, trace.evaluations, 0), strict=True))
+        stats["backend"] = "torchdiffeq"
         ended = record.end is not None
         trace.failed = bool(failure) and not ended
         if trace.failed:
@@ -204,13 +191,9 @@ class Watched(ByVectorField):
             if problem.t_eval is None and not (times.size and times[-1] == t_end):
                 times, states = np.append(times, t_end), [*states, record.end[1]]
         status: Any = 1 if ended else -int(bool(failure))
-        outcome = Outcome(
-            times,
-            stack(states, axis=0) if states else y0[None][:0],
-            np.full(y0.shape[:-1], status) if y0.ndim > 1 else status,
-            (ENDED if status == 1 else failure or finished(problem)) + trace.note,
-            stats,
-        )
+        message = (ENDED if status == 1 else failure or finished(problem)) + trace.note
+        y = stack(states, axis=0) if states else y0[None][:0]
+        outcome = Outcome(times, y, np.full(y0.shape[:-1], status) if y0.ndim > 1 else status, message, stats)
         if problem.dense_output:
             outcome.sol = Piecewise(kept, y0, t0, t_end)
         return outcome, trace
@@ -253,13 +236,20 @@ def run_in_parts(method: Watched, problem: Problem, joint: Outcome, trace: Trace
     stats: dict[str, Any] = {**counts, "backend": "torchdiffeq"}
     if not done.all():
         stats["failed_at"] = np.where(done, np.nan, reached).reshape(batch)
-    outcome = Outcome(
-        times,
-        stack([run.y[:, j] for run, j in source], axis=1).reshape(len(times), *problem.y0.shape),
-        np.where(done, 0, -1).reshape(batch),
-        _message(method, batch, source, done, unfinished, reached) or finished(problem),
-        stats,
-    )
+    said = []
+    if len(failed := np.flatnonzero(~done & ~unfinished)):
+        said.append(f"Trajectory {_index(failed[0], batch)}: {source[failed[0]][0].message}")
+    if unfinished.any():
+        first = np.argmax(unfinished)
+        said.append(
+            f"`max_num_steps` = {method.most_steps} steps, in sum over the batch and the parts that it was run in "
+            f"because some of its trajectories fail, ended before {unfinished.sum()} of {n} trajectories: they are "
+            f"kept up to where they were, trajectory {_index(first, batch)} up to t = {reached[first]:.15g}. Raise "
+            "`max_num_steps`, or solve those that fail in another call, or end `t_span` before they do."
+        )
+    y = stack([run.y[:, j] for run, j in source], axis=1).reshape(len(times), *problem.y0.shape)
+    status = np.where(done, 0, -1).reshape(batch)
+    outcome = Outcome(times, y, status, " ".join(said) or finished(problem), stats)
     if problem.dense_output:
         outcome.sol = Batch([(run.sol, j) for run, j in source], batch, (problem.t0, problem.t1))
     return outcome
@@ -282,29 +272,6 @@ def _divided(problem: Problem, part: np.ndarray, trace: Trace) -> list[np.ndarra
     return [np.sort(part[order[:cut]]), np.sort(part[order[cut:]])]
 
 
-def _message(
-    method: Watched,
-    batch: tuple[int, ...],
-    source: list[tuple[Outcome, int]],
-    done: np.ndarray,
-    unfinished: np.ndarray,
-    reached: np.ndarray,
-) -> str:
-    said = []
-    failed = np.flatnonzero(~done & ~unfinished)
-    if len(failed):
-        said.append(f"Trajectory {_index(failed[0], batch)}: {source[failed[0]][0].message}")
-    if unfinished.any():
-        first = np.argmax(unfinished)
-        said.append(
-            f"`max_num_steps` = {method.most_steps} steps, in sum over the batch and the parts that it was run in "
-            f"because some of its trajectories fail, ended before {unfinished.sum()} of {len(done)} trajectories: they "
-            f"are kept up to where they were, trajectory {_index(first, batch)} up to t = {reached[first]:.15g}. Raise "
-            "`max_num_steps`, or solve those that fail in another call, or end `t_span` before they do."
-        )
-    return " ".join(said)
-
-
 def _index(i: Any, batch: tuple[int, ...]) -> str:
     return ", ".join(str(k) for k in np.unravel_index(int(i), batch))
 
@@ -316,7 +283,8 @@ class Adaptive(Watched, RungeKutta):
     The trajectories of a batch share their steps; if that fails, it is run in parts, so that those of its trajectories
     that can reach their end do. Without `t_eval` the
     states are reported every `system.dt`. Between the steps, for outputs, events and the dense output alike, the state
-    is torchdiffeq's interpolation: the quartic through both ends, their slopes and the state at the middle of the step.
+    is a polynomial through both ends with their slopes: of "dopri5" torchdiffeq's quartic, through the middle as well,
+    and of "dopri8" that of degree 7, through steps to the thirds, of which torchdiffeq's quartic is far less exact.
 
     Parameters
     ----------
@@ -331,7 +299,6 @@ class Adaptive(Watched, RungeKutta):
     rtol: float = 1e-7
     atol: float = 1e-9
     max_num_steps: int = 5_000
-
     tableau: ClassVar[Tableau]
 
     def __post_init__(self) -> None:
@@ -362,7 +329,7 @@ class Adaptive(Watched, RungeKutta):
         return int(self.max_num_steps)
 
     def make_trace(self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array, visit: Visit) -> Trace:
-        return _Stages(self.tableau, system, t_span, y0, visit)
+        return _Stages(self, system, t_span, y0, visit)
 
     def integrate(self, trace: Trace, y: Any, length: float) -> None:
         import torch
@@ -406,9 +373,9 @@ class Adaptive(Watched, RungeKutta):
 class _Stages(Trace):
     """Collects the slopes of each step: torchdiffeq interpolates from them."""
 
-    def __init__(self, tableau: Tableau, *arguments: Any) -> None:
+    def __init__(self, method: Adaptive, *arguments: Any) -> None:
         super().__init__(*arguments)
-        self.tableau = tableau
+        self.method, self.tableau = method, method.tableau
         self.first: Any = None
         self.slopes: list[Any] = []
 
@@ -426,10 +393,20 @@ class _Stages(Trace):
         if not differentiable(s, dt):
             s, dt = float(s), float(dt)
         t0, t1 = (self.t_span[0] + self.direction * x for x in (s, s + dt))
-        h = self.direction * dt
-        y1, middle = (y + h * weighted(weights, K) for weights in (self.tableau.B, self.tableau.middle))
         self.first = self.slopes[-1]
-        self.announce(quartic(t0, t1, y, y1, middle, K[0], K[-1]))
+        self.announce(Interpolant(t0, t1, y, lambda: self._inside(t0, t1, y, K)))
+
+    def _inside(self, t0: Any, t1: Any, y: Array, K: list[Array]) -> tuple[list[Array], list[Array]]:
+        """The states and slopes of a step that it is interpolated from."""
+        h, tableau = t1 - t0, self.tableau
+        states, slopes = [y, y + h * weighted(tableau.B, K)], [K[0], K[-1]]
+        if tableau.middle:
+            states.append(y + h * weighted(tableau.middle, K))
+        elif tableau.order > 3:  # of a cubic
+            states += [self.method.step(self.system, t0, y, x * h) for x in THIRDS]
+            slopes += [self.system.vector_field(z, t0 + x * h) for x, z in zip(THIRDS, states[2:], strict=True)]
+            self.evaluations += len(THIRDS) * (len(tableau.B) + 1)
+        return states, slopes
 
 
 @dataclass(frozen=True)
@@ -448,7 +425,6 @@ class Adams(Watched):
 
     dt: float | None = None
     max_order: int = 4
-
     symplectic: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
@@ -518,7 +494,8 @@ class _Nodes(Trace):
         before, self.before = self.before, (y, f)
         if before is not None:
             k = self.n_steps
-            self.announce(hermite(self.times[k], self.times[k + 1], before[0], y, before[1], f))
+            values = (before[0], y), (before[1], f)
+            self.announce(Interpolant(self.times[k], self.times[k + 1], before[0], lambda: values))
 
 
 @cache

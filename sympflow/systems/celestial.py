@@ -84,7 +84,7 @@ def decaying_orbit(drag: float = 0.002, e: float = 0.3) -> DoubledSystem:
     p = 1.25 * math.sqrt((1 + e) / (1 - e))
     high = np.array([1.2 * (1 + e), 1.2 * (1 + e), 0.1, 0.1, 0.1, 0.1, p, p])
     scene: dict[str, Any] = {"y0": orbit.y0, "t_span": (0.0, 10 * math.pi), "dt": 2 * math.pi / 500}
-    free = HamiltonianSystem.from_sympy(orbit.symbols.H, name="kepler", **scene)  # type: ignore[union-attr]
+    free = HamiltonianSystem.from_sympy(orbit.symbols.H, name="kepler", **scene)
     forces = ["-k*p1/(q1**2 + q2**2)", "-k*p2/(q1**2 + q2**2)"]
     return doubled(free, forces, params={"k": drag}, domain=Box(-high, high), name="decaying_orbit")
 

@@ -16,8 +16,7 @@ from typing import Any
 from sympflow.arguments import did_you_mean
 from sympflow.hamiltonian.domain import Ball, Box, EnergySublevel, Tube, domain_from_dict
 from sympflow.hamiltonian.lattice_states import LatticeStates
-from sympflow.hamiltonian.scene import UNNAMED
-from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.hamiltonian.system import UNNAMED, HamiltonianSystem
 
 DOMAINS: dict[str, tuple[str, ...]] = {  # the kinds of domains in a TOML file, and the keys of each
     "Ball": ("center", "radius"),

@@ -1,9 +1,8 @@
 """Levenberg–Marquardt: least squares by Gauss–Newton steps, damped where the linear model fails.
 
 There is one method, `descend`, of the steps of `damped_step`, and a `LinearModel` for each way to solve the linear
-problem of a step: `levenberg_marquardt` minimizes a function of a few numbers by compiled QR factorizations,
-`GaussNewtonSteps` trains the weights of a flow by Cholesky's factors, one step at a time, and
-`sympflow.learning.shooting` eliminates the initial states of orbits.
+problem of a step: QR factorizations of a few numbers, Cholesky's factors of the weights of a flow, and in
+`sympflow.learning.shooting` elimination of the initial states of orbits.
 
 References
 ----------
@@ -167,10 +166,7 @@ def levenberg_marquardt(
         return model
 
     level = Damping(damping, LEAST_DAMPING)
-    try:
-        costs = [cost_at(x)]
-    except OutOfTime:
-        return Minimum(x, math.inf, 0, STOPPED)
+    costs = [cost_at(x)]
     if not math.isfinite(costs[0]):
         return Minimum(x, math.inf, 0, "the residuals are not finite at the start")
     options: Any = {"damping": level, "tries": MAX_REJECTED, "iterations": iterations, "patience": patience}
@@ -287,8 +283,7 @@ def check_parameters(flow: FlowMap, keeps: str) -> None:
 class GaussNewtonSteps:
     """Levenberg–Marquardt on the residuals of a flow, one accepted step at a time; it trains networks best.
 
-    To r belongs a tiny multiple of the weights: a neuron that is saturated at all points may else run off to a step of
-    any slope. The steps end where `PATIENCE` of them on the same points lower the loss by less than 1 %, or none does.
+    To r belongs a tiny multiple of the weights: a neuron that is saturated at all points may else run off.
     """
 
     needs_residuals: ClassVar[bool] = True

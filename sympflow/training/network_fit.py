@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-import warnings
 from typing import Any, ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from sympflow.arguments import warn
 from sympflow.flow.flow_map import FlowMap
 from sympflow.flow.scaling import Scaling
 from sympflow.flow.weights import check_memory
@@ -265,11 +265,10 @@ def _end_of_step(
     try:
         return reference_step(system, x, dt, check=deadline.check, t0=t0)
     except OutOfTime:
-        warnings.warn(
+        warn(
             f"There was no time to follow {len(x)} held-out states to dt = {dt:g}: the one-step error of the flow is "
             "not known. Give a longer `time_budget`, a shorter `dt`, or fewer `reference_states`.",
             RuntimeWarning,
-            stacklevel=6,
         )
         return np.full_like(x, np.nan)
 

@@ -6,7 +6,6 @@ Labels say where the exact flow takes sampled states, at several times. They are
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import IntEnum
@@ -16,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from sympflow.arguments import warn
 from sympflow.arrays import to_numpy
 from sympflow.flow.sympflow import Drive
 from sympflow.hamiltonian.domain import Domain
@@ -344,12 +344,10 @@ def warn_of_another_system(data: Labelled, system: HamiltonianSystem) -> None:
         moved = np.linalg.norm((y[rows] - x[rows]) / unit, axis=-1)
     away = away[np.isfinite(away)]
     if len(away) and np.median(away) >= 0.1 * np.median(moved) and np.median(away) > COMPARED_TO:
-        warnings.warn(
+        warn(
             f"`data` are not labels of the system {system.name!r}: its exact flow takes the labelled states elsewhere, "
             f"in the median {np.median(away) / max(np.median(moved), 1e-300):.1e} times as far as they move. Figures "
-            "such as one_step_error compare with H of the system, and say nothing of your data: give its own system.",
-            UserWarning,
-            stacklevel=5,
+            "such as one_step_error compare with H of the system, and say nothing of your data: give its own system."
         )
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Generator
 from dataclasses import dataclass
@@ -11,6 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 
+from sympflow.arguments import warn
 from sympflow.flow.flow_map import FlowMap
 from sympflow.flow.scaling import Scaling
 from sympflow.flow.sympflow import Drive
@@ -163,7 +163,7 @@ class Run(ABC):
         An end that is expected does not warn, unless it came before the first of its steps.
         """
         if reason is not None and not (expected and self.done and reason == OUT_OF_TIME):
-            warnings.warn(self.ended_early(reason), RuntimeWarning, stacklevel=4)
+            warn(self.ended_early(reason), RuntimeWarning)
         flow, figures = self.flow, self.achieved()
         flow.requires_grad_(False)
         flow.zero_grad(set_to_none=True)
@@ -195,15 +195,13 @@ class Run(ABC):
         no_better = verlet is not None and mean >= verlet[0] > 0
         if mean >= USELESS or no_better:
             beside = f", no better than one Verlet step with {verlet[0]:.1e}" if verlet and no_better else ""
-            warnings.warn(
+            warn(
                 f"The flow is far from the exact one: at held-out states its error in one step of dt = "
                 f"{self.flow.dt:g} is {mean:.1e} times what a step moves them (in the median {median:.1e} times)"
-                f"{beside}. {self.remedy}",
-                UserWarning,
-                stacklevel=5,
+                f"{beside}. {self.remedy}"
             )
         elif (words := self.left_out()) is not None:
-            warnings.warn(words, UserWarning, stacklevel=5)
+            warn(words)
         return {"missed_share": mean} | ({} if verlet is None else {"verlet_missed_share": verlet[0]})
 
     # checkpoints ------------------------------------------------------------------------------------------

@@ -100,10 +100,9 @@ class Session:
         deadline: Deadline,
         threads: bool = False,
     ) -> Generator[Any]:
-        """Yield `function(common, item)` of each item in order, done by the pool; the function is one of a module.
+        """Yield `function(common, item)` of each item in order, by the pool, or by `threads` where that is this one.
 
-        Where the pool is this thread alone, `threads` share the work. While others work Ctrl-C raises KeyboardInterrupt
-        here; after that, or where workers do not answer soon after the deadline, this thread does the rest.
+        While others work Ctrl-C raises here; then, or if they answer too late, this thread does the rest.
         """
         interruption = self.interruption
         ended = interruption.asked or deadline.left <= 0

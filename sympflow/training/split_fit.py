@@ -16,7 +16,7 @@ from scipy.linalg import block_diag
 
 from sympflow.flow.coefficients import Column
 from sympflow.flow.split import SplitFlow
-from sympflow.hamiltonian.parts import ExactParts, SubFlow
+from sympflow.hamiltonian.parts import SubFlow
 from sympflow.kernels.parts_loops import PartsLoops, parts_loops
 from sympflow.training.least_squares import Check, Minimum, Problem, put_weights
 from sympflow.training.points import Labels, Stream, shares_missed, step_errors, stream_seed
@@ -105,6 +105,7 @@ class SplitProblem(Problem):
     def __init__(self, run: SplitRun, deadline: Deadline) -> None:
         flow, system, domain, fit = run.flow, run.system, run.domain, run.fit
         self.flow, self.fit, self.solver = flow, fit, run.solver
+        self.parts, self.columns = flow.parts, flow.columns()
         ends = np.cumsum([(c.n + 1) // 2 for c in self.columns])
         self.slices = [slice(int(end) - (c.n + 1) // 2, int(end)) for c, end in zip(self.columns, ends, strict=True)]
         self.n = int(ends[-1]) if len(ends) else 0
@@ -118,16 +119,8 @@ class SplitProblem(Problem):
         self.held_out = Labels.drawn(*unseen, deadline.part(LABEL_SHARE), needed=False)
 
     @property
-    def parts(self) -> ExactParts:
-        return self.flow.parts
-
-    @property
     def kernel(self) -> PartsLoops:
         return parts_loops(self.parts)
-
-    @property
-    def columns(self) -> list[Column]:
-        return self.flow.columns()
 
     def _modes(self, y: np.ndarray) -> np.ndarray:
         return np.ascontiguousarray(np.concatenate(self.parts.to_modes(y), axis=-1))
@@ -138,8 +131,8 @@ class SplitProblem(Problem):
         unit = np.where(spread > 0, spread, 1.0)
         linear, d = self.parts.linear, self.parts.ndof
         for j in range(d if linear is not None else 0):
-            if linear.kinds[j] == "oscillator" and energy > 0:  # type: ignore[union-attr]
-                unit[[j, d + j]] = math.sqrt(energy / linear.rates[j])  # type: ignore[union-attr]
+            if linear.kinds[j] == "oscillator" and energy > 0:
+                unit[[j, d + j]] = math.sqrt(energy / linear.rates[j])
         return unit
 
     def _joined(self, half: Callable[[Column, int], Any]) -> np.ndarray:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-import warnings
 
 import numpy as np
 from scipy.integrate import DOP853
 
+from sympflow.arguments import warn
 from sympflow.flow.scaling import Scaling
 from sympflow.hamiltonian.domain import Domain
 from sympflow.hamiltonian.system import HamiltonianSystem
@@ -134,11 +134,9 @@ def warn_of_domain(system: HamiltonianSystem, domain: Domain) -> None:
     if not defined.all():
         corners = box_without(y[defined], y[~defined])
         remedy = "Shrink `domain`." if corners is None else f"Take Box({corners[0]}, {corners[1]}), without them."
-        warnings.warn(
+        warn(
             f"H of the system {system.name!r} is not finite at {(~defined).sum()} of {len(y)} states of `domain`, "
-            f"where a flow means nothing. {remedy}",
-            UserWarning,
-            stacklevel=4,
+            f"where a flow means nothing. {remedy}"
         )
         y = y[defined]
         if not len(y):
@@ -171,7 +169,7 @@ def warn_of_domain(system: HamiltonianSystem, domain: Domain) -> None:
             f"{PHASE / half:.1e}. Without them the domain is about Box({low}, {high}): take that, or a smaller one "
             "that holds your orbits, or give `dt`."
         )
-    warnings.warn(words, UserWarning, stacklevel=4)
+    warn(words)
 
 
 @np.errstate(all="ignore")

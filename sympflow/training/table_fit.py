@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import copy
 import math
-import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, ClassVar
@@ -18,6 +17,7 @@ import numpy as np
 import torch
 from scipy.linalg import null_space
 
+from sympflow.arguments import warn
 from sympflow.flow.coefficients import Coefficients
 from sympflow.flow.primed import PrimedFlow
 from sympflow.flow.scaling import Scaling
@@ -123,9 +123,6 @@ class TableRun(SearchRun):
                 slope = energy_slope(system, labels, options.energy_weight)
                 self._fit_frozen(labels, slope)
         if options.residual_weight or options.matching_weight or data is not None:
-            system.check_autonomous(
-                "and losses at points compare a table at no time of it", "fit it to labels, loss='labels'"
-            )
             rest = options.label_weight if data is not None else 0.0
             loss = Loss(system, scaling, options.residual_weight, options.matching_weight, rest)
             shape = (flow.dt, options.loss_points, options.matching_times, options.seed, flow.dtype, flow.device)
@@ -195,7 +192,7 @@ class TableRun(SearchRun):
         late = self.whole_end.over()
         if late or not tables:
             reason = "the time was up" if late else "those of the flow do not stay finite: take a shorter `dt`"
-            warnings.warn(f"The flow was not fitted to `runs`, because {reason}.", RuntimeWarning, stacklevel=8)
+            warn(f"The flow was not fitted to `runs`, because {reason}.", RuntimeWarning)
             self.runs = None
             return False
         common = both, min(self.most_steps, RUN_STEPS), self.whole_end, False
@@ -286,12 +283,11 @@ class TableRun(SearchRun):
         self.kept_start = True
         if session.interruption.asked or after < CLOSE * before:  # as when a fit is fitted again
             return self.at_start
-        warnings.warn(
+        warn(
             f"The fit has a larger held-out error ({after:.1e}, in units of the spread of `domain`) than the flow that "
             f"it started from ({before:.1e}), which is returned: its data are too few, too far from Δt, or not of this "
             "system; or H is singular in `domain`, nearly so, or has a kink: shrink that.",
             RuntimeWarning,
-            stacklevel=7,
         )
         return self.at_start
 

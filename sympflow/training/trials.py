@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sympflow.arguments import warn
 from sympflow.compiler import NotCompiled
 from sympflow.flow.primed import PrimedFlow
 from sympflow.flow.scaling import Scaling
@@ -154,12 +154,11 @@ def chosen_trial(system: HamiltonianSystem, domain: Domain, session: Session | N
 def _warn_if_cut(session: Session, n_tried: int, wanted: Collection[PrimedFit]) -> None:
     """Warn where the time ended the trials, not Ctrl-C: the flow may be far from what `train` finds else."""
     if n_tried < len(wanted) and not session.interruption.asked:
-        warnings.warn(
+        warn(
             f"`time_budget`: the share for trials of {session.time_budget:g} s was over, as on a busy machine, after "
             f"{n_tried} of {len(wanted)} or more flows; another one may take far less time than that which is fitted. "
             "Give a longer `time_budget`.",
             RuntimeWarning,
-            stacklevel=7,
         )
 
 

@@ -96,13 +96,6 @@ def test_gradients_of_the_closed_forms():
 # every t -------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("t", "dt", "k"), [(0.3, 0.1, 3), (0.7, 0.1, 7), (1e5, 0.1, 10**6), (1.0, 1.0, 1), (0.0, 0.1, 0)]
-)
-def test_a_multiple_of_dt_is_exactly_so_many_steps(t, dt, k):
-    assert whole_steps(t, dt) == (k, 0.0)
-
-
 @given(k=st.integers(0, 10**6), dt=st.floats(1e-3, 10), fraction=st.floats(1e-6, 1 - 1e-6))
 def test_step_counts(k, dt, fraction):
     assert whole_steps(k * dt, dt) == (k, 0.0)

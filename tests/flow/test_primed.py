@@ -1,6 +1,5 @@
 """Primed SympFlows: splitting schemes whose coefficients depend on t, and SympFlows in every respect."""
 
-import copy
 import re
 
 import numpy as np
@@ -107,16 +106,6 @@ def test_palindromes_halve_the_parameters():
 # processed ----------------------------------------------------------------------------------------------------
 
 
-def test_a_processed_flow_is_its_kernel_in_other_coordinates():
-    flow, x = processed(), states(HH)
-    t = torch.linspace(0.0, 1.0, len(x), dtype=torch.float64)
-    y = flow.finish(t, flow.kernel_step(t, flow.prepare(t, x)))
-    torch.testing.assert_close(flow.psi(t, x), y, rtol=0, atol=16 * EPS)
-    torch.testing.assert_close(flow.prepare(t, flow.finish(t, x)), x, rtol=0, atol=64 * EPS)
-    back = flow.finish(t, flow.kernel_step(t, flow.prepare(t, y), back=True))
-    torch.testing.assert_close(back, x, rtol=0, atol=256 * EPS)
-
-
 def test_a_processed_palindrome_reverses_with_the_momenta():
     """ρ ψ̄_t ρ = ψ̄_{−t}, as for the exact flow: every coefficient is odd in t."""
     flow, x = processed(size=0.2), states(HH)
@@ -195,15 +184,6 @@ def test_gradients_flow_through_a_processed_run():
 # frozen, it is a scheme: the compiled loops ---------------------------------------------------------------------
 
 
-@pytest.mark.slow
-def test_the_kernel_steps_each_state_by_its_own_time(flow):
-
-    y = flow.system.domain.sample(6, 2)
-    h = flow.dt * np.array([1.0, 0.25, 0.0, -0.25, 0.25, -1.0])
-    expected = flow(torch.tensor(h), torch.tensor(y)).numpy()
-    np.testing.assert_allclose(flow.kernel_for(flow.system).step(h, y).states, expected, atol=1e3 * EPS)
-
-
 def test_trained_weights_are_never_compiled_in():
     flow = random_flow(HH, stages=2)
     before = solve(HH, flow, (0.0, 3.0)).y
@@ -240,14 +220,11 @@ def test_evaluations_are_counted():
 
 
 def test_files_hold_the_numbers_and_solve_gives_the_system(flow, tmp_path):
-    path, system = tmp_path / "flow.safetensors", flow.system
-    flow.save(path)
-    loaded = sympflow.load(path)
+    flow.save(tmp_path / "flow.safetensors")
+    loaded = sympflow.load(tmp_path / "flow.safetensors")
     assert loaded.scheme(0.4 * flow.dt) == flow.scheme(0.4 * flow.dt)
     with pytest.raises(ValueError, match=r"^`flow` is primed with the V and T of a system"):
-        loaded(0.1, states(system))
-    given = {"t_span": (0.0, 2.5 * flow.dt), "y0": system.domain.sample(1, 0)[0], "on_domain_exit": "ignore"}
-    np.testing.assert_array_equal(solve(system, loaded, **given).y, solve(system, flow, **given).y)
+        loaded(0.1, states(flow.system))
 
 
 @pytest.mark.parametrize(
@@ -287,22 +264,6 @@ def test_a_damaged_plan_is_refused(tmp_path, change):
     tampered(path, lambda record: record["architecture"]["primed"].update(change))
     with pytest.raises(ValueError, match="is not a usable flow"):
         sympflow.load(path)
-
-
-def test_copies_share_the_system_and_not_the_numbers():
-    flow = random_flow(HH)
-    other = copy.deepcopy(flow)
-    other.kicks.free.zero_()
-    assert other.system is flow.system
-    assert not torch.equal(other(1.0, states(HH)), flow(1.0, states(HH)))
-
-
-def test_float32():
-    flow, double = SympFlow.primed(HH, 3, dtype=torch.float32), SympFlow.primed(HH, 3)
-    y, expected = flow(1.0, states(HH).float()), double(1.0, states(HH))
-    assert y.dtype == torch.float32
-    torch.testing.assert_close(y.double(), expected, rtol=0, atol=1e-6)
-    assert solve(HH, flow.requires_grad_(False), (0.0, 2.0), dtype="float32").y.dtype == np.float32
 
 
 def test_kicks_without_force_gradients_keep_none(tmp_path):

@@ -33,20 +33,6 @@ def test_solve_is_the_flow_at_every_t(flow):
     assert sol.stats["n_steps"] == 5  # four of Δt and a shorter one
 
 
-def test_a_flow_is_a_method():
-    sol = solve(HH, FLOW, (0.0, 2.0), on_domain_exit="ignore")
-    np.testing.assert_array_equal(sol.y, solve(HH, "sympflow", (0.0, 2.0), flow=FLOW, on_domain_exit="ignore").y)
-    assert sol.t.tolist() == [0.0, 0.5, 1.0, 1.5, 2.0]
-
-
-def test_backward_time_is_the_exact_inverse():
-    there = solve(HH, FLOW, (0.2, 2.2), y0=Y0, on_domain_exit="ignore")
-    back = solve(HH, FLOW, (2.2, 0.2), y0=there.y[..., -1], t_eval=[1.9, 0.2], on_domain_exit="ignore")
-    end = torch.tensor(np.ascontiguousarray(there.y[..., -1]))
-    np.testing.assert_allclose(back.y[..., 0], FLOW.inverse(0.3, end).numpy(), atol=32 * EPS)
-    np.testing.assert_allclose(back.y[..., 1], Y0, atol=1e3 * EPS)
-
-
 def test_the_unconstrained_flow_has_no_way_back():
     with pytest.raises((TypeError, ValueError), match=r"^`t_span` runs backwards, but method .mlp. has no inverse"):
         solve(HH, MLP, (1.0, 0.0))
@@ -60,14 +46,6 @@ def test_a_smaller_step_composes_another_map():
     for _ in range(4):
         y = FLOW(0.25, y)
     np.testing.assert_allclose(sol.y[:, -1], y.numpy(), atol=32 * EPS)
-
-
-def test_step_and_inverse():
-    integrator = get("sympflow")(flow=FLOW)
-    for h in (0.5, 0.2, -0.3):
-        y = integrator.step(HH, 0.0, Y0, h)
-        np.testing.assert_allclose(integrator.inverse(HH, 0.0, y, h), Y0, atol=1e3 * EPS)
-    assert (integrator.order, integrator.symplectic, get("mlp").symplectic) == (None, True, False)
 
 
 def test_metrics_of_the_map_as_executed():

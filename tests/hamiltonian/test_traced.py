@@ -10,6 +10,7 @@ import torch
 from scipy import special
 from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline
+from torch.nn import functional as F
 
 from sympflow import HamiltonianSystem, lyapunov, solve
 from sympflow.compiler.program import gradient
@@ -83,6 +84,9 @@ NUMPY = {
     "elementary": lambda q: (np.exp(-(q**2)) + np.log(1 + q**2) + np.sqrt(1 + q * q) + np.tanh(q)).sum(-1),
     "bases": lambda q: (np.log10(2 + q) + np.log2(2 + q) + np.exp2(q) + np.cbrt(q) + np.logaddexp(q, 1)).sum(-1),
     "rounding": lambda q: (np.floor(3 * q) * q + np.mod(q, 0.3) + np.fmod(q, 0.3) + np.trunc(9 * q) * q).sum(-1),
+    "nearest image": lambda q: ((q - np.round(q)) ** 2 + (q - np.rint(q)) ** 4 + (3 * q).round(1) + np.fix(q)).sum(-1),
+    "order": lambda q: np.sort(q, axis=-1) @ M + np.ptp(q, axis=-1) + np.sort(q[..., :2, None], -2)[..., 0, 0] ** 3,
+    "finite": lambda q: np.where(np.isnan(q), 0.0, np.where(np.isfinite(q), q, 1.0) ** 2).sum(-1),
     "maximum": lambda q: np.maximum(q, 0.1).sum(-1) + np.clip(q, -0.2, 0.2).sum(-1) + q.max(-1) + q.min(-1),
     "abs and prod": lambda q: abs(q).sum(-1) + np.abs(q).prod(-1) + np.sign(q[..., 0]) * q[..., 0],
     "arctan2": lambda q: np.arctan2(q[..., 0], q[..., 1]) + np.hypot(q[..., 2], q[..., 3]),
@@ -120,8 +124,11 @@ TORCH = {
     "zeros": lambda q: torch.zeros(q.shape[:-1], dtype=q.dtype, device=q.device) + q[..., 0] ** 2,
     "cumsum": lambda q: (torch.cumsum(q, -1) ** 2).sum(-1), "logsumexp": lambda q: torch.logsumexp(q, -1),
     "softmax": lambda q: (torch.softmax(q, -1) * q).sum(-1),
-    "activations": lambda q: (torch.nn.functional.gelu(q) + torch.nn.functional.softplus(q) + q.sigmoid()
-                              + torch.nn.functional.silu(q)).sum(-1),
+    "activations": lambda q: (F.gelu(q) + F.softplus(q) + q.sigmoid() + F.silu(q)).sum(-1),
+    "more activations": lambda q: (F.gelu(q, approximate="tanh") + F.softplus(q, 3.0) + F.mish(q) + F.celu(q, 0.5)
+                                   + F.leaky_relu(q, 0.1) + F.softsign(q) + F.logsigmoid(q) + F.tanhshrink(q)
+                                   + F.hardtanh(q) + F.elu(q, 0.3) + F.dropout(q, 0.5, False)).sum(-1),
+    "order": lambda q: q.sort(-1)[0] @ MT + torch.sort(q, dim=-1).values[..., 0] ** 3 + ((q - q.round()) ** 2).sum(-1),
     "outer": lambda q: (q[..., :, None] * q[..., None, :] * AT).sum((-1, -2)),
     "pairs by indices": lambda q: (1 / (q[..., FIRST] - q[..., SECOND]).abs()).sum(-1),
     "det": lambda q: torch.linalg.det(matrix(q, torch)),
@@ -133,7 +140,8 @@ UNTRACEABLE = {
     "math": (lambda q: math.cos(q[0]), "write np.cos for math.cos"),
     "float": (lambda q: float(q[0]) ** 2, "float()"),
     "a mask": (lambda q: q[q > 0].sum(-1), "indexes by a condition: write np.where"),
-    "sort": (lambda q: np.sort(q)[..., 0], "numpy.sort has no rule"),
+    "median": (lambda q: np.median(q, axis=-1), "numpy.median has no rule"),
+    "dropout": (lambda q: F.dropout(q).sum(-1), "call its eval()"),
     "fft": (lambda q: (np.abs(np.fft.rfft(q)) ** 2).sum(-1), "numpy.fft.rfft has no rule"),
     "any": (lambda q: q.sum(-1) if np.any(q > 0) else 0.0 * q.sum(-1), "write np.where"),
     "min": (lambda q: min(q[0], q[1]), "write np.where"),

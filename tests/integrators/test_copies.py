@@ -67,6 +67,17 @@ def test_copies_that_drift_apart_are_told(system):
         sympflow.solve(system, "tao4", (0, 100), dt=0.05, omega=0.5)
 
 
+def test_lanes_of_vmap_run_as_they_do_alone_and_are_told_likewise(system):
+    lanes = torch.tensor(system.y0) * torch.linspace(0.7, 1.3, 3, dtype=torch.float64)[:, None]
+
+    def end(y, omega=4.0):
+        return sympflow.solve(system, "tao4", (0, 1), y, dt=0.05, omega=omega).y[..., -1]
+
+    torch.testing.assert_close(torch.vmap(end)(lanes), torch.stack([end(y) for y in lanes]), rtol=0, atol=1e-14)
+    with pytest.warns(RuntimeWarning, match="^The two copies"):
+        torch.vmap(lambda y: sympflow.solve(system, "tao2", (0, 10), y, dt=0.2, omega=0.5).y)(lanes[:2])
+
+
 def test_a_run_goes_back_is_thinned_and_pickled(system):
     forward = sympflow.solve(system, "tao4", (0, 2), dt=0.05, dense_output=True)
     back = sympflow.solve(system, "tao4", (2, 0), forward.y[:, -1], dt=0.05)

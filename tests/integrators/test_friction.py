@@ -18,8 +18,6 @@ from sympflow.integrators.base import FixedStep
 from sympflow.interop.scipy import as_scipy
 from sympflow.schemes import SCHEMES
 from sympflow.systems import damped_oscillator, damped_pendulum, pendulum
-from sympflow.testing.checks import CHECKS, check_integrator
-from sympflow.testing.laws import NotApplicable
 
 EVERY_SCHEME = pytest.mark.parametrize("name", SCHEMES)
 MATRIX = np.array([[0.5, 0.3], [0.3, 0.4]])
@@ -238,20 +236,6 @@ def test_drifts_back_in_time_bound_the_step():
 # every method --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", sorted({*sympflow.available()}))
-def test_every_method_takes_friction_or_refuses_it(name):
-    """The friction moves the end by 0.3; what runs is within a tenth of that, so it has not left it out."""
-    system = damped_pendulum(0.5)
-    truth = solve(system, "dop853", (0, 1.0), rtol=1e-12, atol=1e-12).y[:, -1]
-    without = solve(pendulum(), "dop853", (0, 1.0), rtol=1e-12, atol=1e-12).y[:, -1]
-    effect = np.abs(truth - without).max()
-    if not sympflow.get(name)().takes_friction or name == "sympflow":  # no flow of it ships
-        with pytest.raises(ValueError, match=r"^`system` 'damped_pendulum' has friction, .* use a splitting method"):
-            solve(system, name, (0, 1.0))
-        return
-    assert np.abs(solve(system, name, (0, 1.0), backend="array").y[:, -1] - truth).max() < effect / 10
-
-
 class Field(FixedStep):
     """A method of a third party that steps by the vector field and says nothing of friction."""
 
@@ -285,29 +269,6 @@ def test_third_parties_say_that_they_take_friction():
             solve(system, method)
     assert solve(system, Informed(dt=0.1), (0, 1.0)).success
     assert solve(pendulum(), Changed(dt=0.1), (0, 1.0)).success
-
-
-def test_the_check_of_integrators_knows_who_takes_friction():
-    check = {check.name: check for check in CHECKS}["friction_is_in_the_steps"]
-
-    class Lying(Changed):
-        @property
-        def takes_friction(self):
-            return True
-
-    class Informed4(sympflow.get("rk4")):
-        @property
-        def takes_friction(self):
-            return True
-
-    check(Informed4(dt=0.1))
-    check(sympflow.get("verlet")(dt=0.05))
-    with pytest.raises(NotApplicable):
-        check(Field(dt=0.05))
-    with pytest.raises(AssertionError, match="of a damped system is wrong by"):
-        check(Lying(dt=0.05))
-    with pytest.raises(ValueError, match="has friction"):
-        check_integrator(lambda: sympflow.get("verlet")(dt=0.05), damped_pendulum())
 
 
 def test_methods_of_peers_and_ours_within_them():
@@ -378,15 +339,6 @@ def test_compiled_gauss_methods_with_friction_are_those_of_arrays(ends):
     assert solve(coupled, "gauss_legendre4", (0, 0.4), dt=0.2).stats["backend"] == "numpy"
     with pytest.raises(ValueError, match="is a matrix"):
         solve(coupled, "gauss_legendre4", (0, 0.4), dt=0.2, backend="compiled")
-
-
-def test_gradients_flow_through_implicit_steps_with_friction():
-    y0 = torch.tensor(TURNING.y0, requires_grad=True)
-    end = solve(TURNING, "gauss_legendre4", (0, 1.0), y0, dt=0.1).y[..., -1]
-    (slope,) = torch.autograd.grad(end[0], y0)
-    y0 = TURNING.y0 + np.array([[1e-5, 0.0], [-1e-5, 0.0]])
-    ahead, behind = solve(TURNING, "gauss_legendre4", (0, 1.0), y0, dt=0.1).y[:, 0, -1]
-    assert float(slope[0]) == pytest.approx((ahead - behind) / 2e-5, rel=1e-8)
 
 
 # what does not hold, or is for later --------------------------------------------------------------------------------

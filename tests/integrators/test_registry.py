@@ -1,5 +1,6 @@
 """The registry: listing without importing, built-ins that cannot be shadowed, plug-ins that break on use only."""
 
+import re
 from dataclasses import dataclass
 from importlib import metadata
 from importlib.metadata import EntryPoint
@@ -86,22 +87,12 @@ def __getattr__(name):
 @pytest.fixture
 def plugins(monkeypatch):
     """Entry points as if installed: one that works, one that breaks, one with a built-in name, one that is none."""
-    points = [
-        EntryPoint("good", f"{__name__}:SymplecticEuler", registry.GROUP),
-        EntryPoint("broken", "a_module_that_does_not_exist:Thing", registry.GROUP),
-        EntryPoint("verlet", f"{__name__}:SymplecticEuler", registry.GROUP),
-        EntryPoint("nothing", "math:pi", registry.GROUP),
-        EntryPoint("leaving", f"{__name__}:leaving_on_import", registry.GROUP),
-        EntryPoint("failing", f"{__name__}:Failing", registry.GROUP),
-        EntryPoint("refusing", f"{__name__}:Refusing", registry.GROUP),
-        EntryPoint("optionless", f"{__name__}:Optionless", registry.GROUP),
-        EntryPoint("failing_step", f"{__name__}:FailingStep", registry.GROUP),
-        EntryPoint("leaving_step", f"{__name__}:LeavingStep", registry.GROUP),
-        EntryPoint("interrupted_step", f"{__name__}:InterruptedStep", registry.GROUP),
-        EntryPoint("failing_check", f"{__name__}:FailingCheck", registry.GROUP),
-        EntryPoint("declining_check", f"{__name__}:DecliningCheck", registry.GROUP),
-        EntryPoint("nameless", f"{__name__}:Nameless", registry.GROUP),
-    ]
+    classes = (Failing, Refusing, Optionless, FailingStep, LeavingStep, InterruptedStep, FailingCheck, DecliningCheck)
+    found = {re.sub("(?<=[a-z])(?=[A-Z])", "_", cls.__name__).lower(): cls.__name__ for cls in (*classes, Nameless)}
+    found |= {"good": "SymplecticEuler", "verlet": "SymplecticEuler", "leaving": "leaving_on_import"}
+    points = [EntryPoint(name, f"{__name__}:{cls}", registry.GROUP) for name, cls in found.items()]
+    points += [EntryPoint("broken", "a_module_that_does_not_exist:Thing", registry.GROUP)]
+    points += [EntryPoint("nothing", "math:pi", registry.GROUP)]
     monkeypatch.setattr(metadata, "entry_points", lambda group: [p for p in points if p.group == group])
     monkeypatch.setattr(registry, "_loaded", {})
     monkeypatch.setattr(registry, "_registered", {})

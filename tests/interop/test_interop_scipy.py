@@ -85,19 +85,6 @@ class TestEveryKind:
         np.testing.assert_allclose(fine.y[:, ::n], coarse.y, atol=200 * EPS)
         np.testing.assert_allclose(fine.sol(fine.t), fine.y, atol=200 * EPS)
 
-    def test_an_empty_interval(self, method):
-        sol = solve_ivp(HH, (2, 2), HH.y0, method=solver(method), dense_output=True)
-        np.testing.assert_array_equal(sol.y[:, -1], HH.y0)
-        np.testing.assert_array_equal(sol.sol(2.0), HH.y0)
-
-    def test_args_are_handed_to_fun_and_events(self, method):
-        def fun(t, y, scale):
-            return scale * HH(t, y)
-
-        sol = solve_ivp(fun, (0, 3), HH.y0, method=solver(method), args=(1.0,), events=lambda t, y, scale: y[0] * scale)
-        np.testing.assert_allclose(sol.y, same(method, (0, 3)).y, atol=200 * EPS)
-        assert sol.t_events[0].size
-
 
 @pytest.fixture
 def counting():
@@ -157,12 +144,6 @@ def test_a_primed_flow_counts_its_forces():
     least = flow.evaluations(35, 35, 0, "compiled")["force_evaluations"]  # T = 49 is 35 steps of Δt = 1.4
     nfev = solve_ivp(HH, (0, 49), HH.y0, method=as_scipy("sympflow", HH), t_eval=[49.0]).nfev
     assert least <= nfev - alone - 1 <= least + 6 * alone  # computed in up to six pieces, each with a start of its own
-
-
-def test_the_exact_flow_finds_all_zeros(rotation):
-    sol = solve_ivp(OSCILLATOR, (0, 200), [1.0, 0.0], method=as_scipy(rotation), events=lambda t, y: y[0])
-    np.testing.assert_allclose(sol.t_events[0], np.pi * (np.arange(64) + 0.5), rtol=0, atol=1e-10)
-    np.testing.assert_allclose(sol.y, [np.cos(sol.t), -np.sin(sol.t)], atol=1e-13)
 
 
 def test_two_events_within_a_step_are_seen_with_max_step(rotation):

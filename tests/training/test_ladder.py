@@ -1,9 +1,6 @@
 """The flows that ship as ladders: chosen by accuracy and cost, listed, built by one command; and what they achieve."""
 
 import json
-import subprocess
-import sys
-import textwrap
 from dataclasses import replace
 from functools import partial
 
@@ -192,13 +189,6 @@ def test_the_list(three):
         shipped_flows(kind="gan")
 
 
-def test_listing_loads_no_weights():
-    code = "import sympflow; print(len(sympflow.shipped_flows())); import sys; assert 'torch' not in sys.modules"
-    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert run.returncode == 0, run.stderr
-    assert int(run.stdout) == len(shipped_flows())
-
-
 # building ------------------------------------------------------------------------------------------------------
 
 
@@ -368,14 +358,3 @@ def test_what_costs_more_is_more_accurate(name):
     assert not [(f.name, g.name) for f, g in cheaper if f.name not in of_state]  # no rung is dominated by another
     assert not [(f.name, g.name) for f, g in cheaper if g.one_step_error / g.dt < f.one_step_error / f.dt]
     assert all(f.cost == pytest.approx(cost_of(f.load()), rel=1e-3) for f in rungs)
-
-
-def test_no_torch_to_choose_a_classical_method():
-    code = textwrap.dedent(
-        """
-        import sympflow, sys
-        sympflow.solve(sympflow.systems.pendulum(), "verlet", (0, 1), backend="array")
-        assert "torch" not in sys.modules and "sympflow.flow.shipped" not in sys.modules
-        """
-    )
-    subprocess.run([sys.executable, "-c", code], check=True)

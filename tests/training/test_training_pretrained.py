@@ -22,7 +22,7 @@ def measured(recipe, flow, **options):
     return recipe.judge.measured(flow, recipe.system, **options)
 
 
-# error of one step and of the energy over 1000 steps, as `measure` defines them: level with the published checkpoints
+# error of one step and of the energy over 1000 steps, as `measured` defines them: level with the published checkpoints
 TARGETS = {
     "harmonic_oscillator": (3.5e-4, 1.9e-3),
     "henon_heiles": (2.3e-3, 1.4e-3),

@@ -58,31 +58,6 @@ def cost_of(flow: Any) -> float:
 # errors -------------------------------------------------------------------------------------------------------------
 
 
-@torch.no_grad()
-def measure(
-    flow: FlowMap, system: HamiltonianSystem, x: np.ndarray, *, steps: int = 1000, omega: float = 1.0
-) -> dict[str, Any]:
-    """Figures of a flow from the initial states x (n, 2d), as the published checkpoints were measured."""
-    units = np.repeat([1.0, omega], system.ndof)
-    y = torch.as_tensor(x, dtype=flow.dtype, device=flow.device)
-    H0 = system.hamiltonian(y)
-    largest = torch.zeros_like(H0)
-    reference, reached = x, 0
-    figures: dict[str, Any] = {}
-    for k in range(1, steps + 1):
-        y = flow.psi(flow.dt, y)
-        # torch.maximum keeps a NaN, so a blow-up is not reported as a small error
-        largest = torch.maximum(largest, (system.hamiltonian(y) - H0).abs())
-        if k in (1, 10, 100):
-            reference, reached = reference_step(system, reference, (k - reached) * flow.dt), k
-            with np.errstate(all="ignore"):
-                figures[f"error_{k}"] = _mean(np.linalg.norm((y.cpu().numpy() - reference) / units, axis=-1))
-    energy = largest.cpu().numpy()
-    figures["energy_error"] = _mean(energy)
-    figures["energy_error_max"] = float(energy.max()) if np.isfinite(energy).all() else None
-    return figures
-
-
 def _mean(values: np.ndarray) -> float | None:
     mean = float(values.mean())
     return mean if math.isfinite(mean) else None
@@ -169,14 +144,33 @@ class ByRuns:
 
 @dataclass(frozen=True)
 class AsPublished:
-    """`measure` of a network, `one_step_errors`, and a certificate if it is symplectic."""
+    """Figures of a network, `one_step_errors`, and a certificate if it is symplectic."""
 
     initial: Callable[[], np.ndarray]
     omega: float = 1.0
 
+    @torch.no_grad()
     def measured(self, flow: FlowMap, system: HamiltonianSystem, steps: int = 1000) -> dict[str, Any]:
-        """`measure` from the initial states."""
-        return measure(flow, system, self.initial(), steps=steps, omega=self.omega)
+        """Figures of a flow from the initial states, as the published checkpoints were measured."""
+        units = np.repeat([1.0, self.omega], system.ndof)
+        x = self.initial()
+        y = torch.as_tensor(x, dtype=flow.dtype, device=flow.device)
+        H0 = system.hamiltonian(y)
+        largest = torch.zeros_like(H0)
+        reference, reached = x, 0
+        figures: dict[str, Any] = {}
+        for k in range(1, steps + 1):
+            y = flow.psi(flow.dt, y)
+            # torch.maximum keeps a NaN, so a blow-up is not reported as a small error
+            largest = torch.maximum(largest, (system.hamiltonian(y) - H0).abs())
+            if k in (1, 10, 100):
+                reference, reached = reference_step(system, reference, (k - reached) * flow.dt), k
+                with np.errstate(all="ignore"):
+                    figures[f"error_{k}"] = _mean(np.linalg.norm((y.cpu().numpy() - reference) / units, axis=-1))
+        energy = largest.cpu().numpy()
+        figures["energy_error"] = _mean(energy)
+        figures["energy_error_max"] = float(energy.max()) if np.isfinite(energy).all() else None
+        return figures
 
     def __call__(self, flow: FlowMap, system: HamiltonianSystem) -> None:
         flow.figures |= self.measured(flow, system)
