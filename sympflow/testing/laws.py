@@ -45,9 +45,7 @@ def start(system: HamiltonianSystem) -> np.ndarray:
     return system.y0
 
 
-def run(
-    integrator: Integrator, system: HamiltonianSystem, t_span: tuple[float, float], y0: Any = None, **arguments: Any
-) -> Solution:
+def run(integrator: Integrator, system: HamiltonianSystem, t_span: Any, y0: Any = None, **arguments: Any) -> Solution:
     """A solution of the integrator's, from the system's y0 unless another is given."""
     y0 = start(system) if y0 is None else y0
     with warnings.catch_warnings():  # the methods of low order are judged by their laws, at any step
@@ -83,9 +81,7 @@ def bare_step(integrator: Integrator, system: HamiltonianSystem) -> str | None:
     return None
 
 
-def _step(
-    integrator: Integrator, system: HamiltonianSystem, t: float = 0.0
-) -> Callable[[np.ndarray, np.ndarray | float], np.ndarray]:
+def _step(integrator: Integrator, system: HamiltonianSystem, t: float = 0.0) -> Callable[[np.ndarray, Any], np.ndarray]:
     reason = bare_step(integrator, system)
     if reason is not None:
         raise NotApplicable(reason)
