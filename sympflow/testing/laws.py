@@ -470,7 +470,7 @@ def states_within_a_step_belong_to_it(integrator: Integrator, system: Hamiltonia
     if isinstance(integrator, FixedStep) and integrator.on_grid and bare_step(integrator, system) is None:
         with np.errstate(all="ignore"):
             expected = np.asarray(integrator.step(system, 0.0, y, fractions * h))[within]
-        assert_close(inside, expected, 1e4 * EPS, "a state within a step is no shorter step from its start, but away")
+        assert_close(inside, expected, 1e4 * EPS, "a state within a step is not the shorter step there, but away")
         return
     reference = solve(system, "dop853", (0.0, T_END), start(system), dense_output=True, rtol=1e-12, atol=1e-14).sol
     assert reference is not None
