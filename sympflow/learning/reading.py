@@ -276,7 +276,9 @@ def _check_different(names: list[str]) -> None:
 def _loaded(data: Any) -> Any:
     """The Dataset in memory, unless what its file tells of would not fit there."""
     if data.nbytes > 8 * MAX_ASKED_VALUES:
-        raise ValueError(f"`data` is {data.nbytes / 2**30:.3g} GiB, over {MAX_ASKED_VALUES:.0e} numbers: give a part.")
+        raise ValueError(
+            f"`data` tells of {data.nbytes / 2**30:.3g} GiB, more than {MAX_ASKED_VALUES:.0e} numbers: give a part."
+        )
     return data.load()
 
 
