@@ -208,9 +208,7 @@ def section(
     seed: Annotated[int, Option(help="Of the states that are drawn.")] = 0,
     dt: Step = None,
     tol: Annotated[Number, Option(help="Take the cheapest shipped flow with so small a relative energy error.")] = None,
-    coordinate: Annotated[
-        Text, Option(help="The coordinate that is constant on the plane: q1, p2. Default: the first.")
-    ] = None,
+    coordinate: Annotated[Text, Option(help="The plane's constant coordinate: q1, p2. Default: the first.")] = None,
     level: Annotated[Number, Option(help="Its value there. Default: 0.")] = None,
     direction: Annotated[
         Text, Option(help="Crossings up, down or both. Default: up.", autocompletion=completion.of(tuple(DIRECTIONS)))

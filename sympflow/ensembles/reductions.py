@@ -197,9 +197,7 @@ def _arrays(value: Any) -> dict[str, np.ndarray]:
         if whole and array.size and max(-int(array.min()), int(array.max())) > EXACT:
             raise ValueError(f"{name} has an integer beyond 2**53, which floats change: return its parts, or a float")
         if array.dtype.kind not in "biufc" or not isinstance(name, str):
-            raise TypeError(
-                f"`reduce` must return numbers, an array of them, or a dict of such by name; got {type(v).__name__}."
-            )
+            raise TypeError(f"`reduce` must return numbers, an array, or a dict of such; got {type(v).__name__}.")
         arrays[name] = array.astype(complex if array.dtype.kind == "c" else float)
     return arrays
 

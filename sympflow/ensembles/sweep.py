@@ -212,9 +212,7 @@ def _axes(system: HamiltonianSystem, params: Any) -> tuple[dict[str, float], dic
         values = floats("params", given)
         if not np.isfinite(values).all():
             where = int(np.flatnonzero(~np.isfinite(np.ravel(values)))[0])
-            raise ValueError(
-                f"`params` has {name} = {np.ravel(values)[where]} at {where}: give finite numbers, or leave it out."
-            )
+            raise ValueError(f"`params` has {name} = {np.ravel(values)[where]} at {where}: give finite ones.")
         if values.ndim > 1 or values.size == 0:
             raise ValueError(
                 f"`params` must give {name!r} a number, or a list of them; got shape {values.shape}. For "

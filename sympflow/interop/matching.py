@@ -64,9 +64,7 @@ class Comparison:
         times = np.full(len(states), t)
         self._close_to_flow(times, states, self.system.vector_field(states, times))
 
-    def at_start(
-        self, fun: RightHandSide, y0: np.ndarray, t_span: tuple[float, float], given: Callable[..., Any] | None = None
-    ) -> None:
+    def at_start(self, fun: RightHandSide, y0: np.ndarray, t_span: tuple[float, float], given: Any = None) -> None:
         """Compare at y0 (..., 2d), at states around it, and in the domain; at y0 alone if `given` is remembered."""
         t0 = t_span[0]
         self.at(t0, y0, fun(t0, y0), fun)

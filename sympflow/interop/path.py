@@ -240,9 +240,7 @@ class Path:
 class DensePath(Path):
     """A path between two `times` (2,) whose states on the grid are computed once."""
 
-    def __init__(
-        self, integrator: FixedStep, system: HamiltonianSystem | None, y0: Tensor, direction: int, times: Tensor
-    ) -> None:
+    def __init__(self, integrator: FixedStep, system: Any, y0: Tensor, direction: int, times: Tensor) -> None:
         super().__init__(integrator, system, y0, direction, times[0])
         count, _ = self.located(times[1:] - times[0])
         self.span = numbers(times)

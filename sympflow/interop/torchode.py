@@ -117,9 +117,7 @@ class SymplecticStep(SingleStepMethod):
     def init(self, term: Any, problem: Any, f0: Tensor | None, *, stats: dict[str, Any], args: Any) -> Run:
         """The state of the method: its run."""
         if problem.n_features != 2 * self.system.ndof:
-            raise ValueError(
-                f"`y0` must have shape (batch, {2 * self.system.ndof}), [q, p]; got {problem.n_features} features."
-            )
+            raise ValueError(f"`y0` must have shape (batch, {2 * self.system.ndof}), [q, p]; got {problem.n_features}.")
         times = to_numpy(torch.stack([problem.t_start, problem.t_end]).detach())
         self.system.check_times(times.min(), times.max())
         return Run(term, problem, self, stats, args)

@@ -218,9 +218,7 @@ def _left(model: Field, data: Trajectories, held: Trajectories, scales: np.ndarr
 # by slopes -----------------------------------------------------------------------------------------------------------
 
 
-def hint(
-    library: Library, smooth: Smooth, data: Trajectories, force: Force | None = None, drives: Sequence[Drive] = ()
-) -> str | None:
+def hint(library: Library, smooth: Smooth, data: Trajectories, force: Any = None, drives: Any = ()) -> str | None:
     """The likeliest reason, none that the model has, why terms do not explain the data, with the remedy; or None."""
     d, scales = data.ndof, data.scales
     smooth = smooth.some(MOST_SLOPES)
@@ -350,9 +348,7 @@ def _refined(X: np.ndarray, smooth: Smooth, scales: Any, drive: Drive, likely: S
     return float(found.x if found.fun < rest(best) else best)
 
 
-def driven(
-    X: np.ndarray, smooth: Smooth, scales: np.ndarray, drive: Drive, known: Sequence[Drive] = ()
-) -> tuple[float, list[float]]:
+def driven(X: Any, smooth: Smooth, scales: Any, drive: Drive, known: Sequence[Drive] = ()) -> tuple[float, list[float]]:
     """The share of other trajectories' squares that drives leave, infinite of a single trajectory, and their ω."""
     first, v, near = smooth.owner % 2 == 0, smooth.slopes, 0.5 * np.pi / smooth.longest
 

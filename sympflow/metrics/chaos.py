@@ -250,9 +250,7 @@ def gali(
     orbits = checked_orbits(system, method, t_span, y0, options, "deviation vectors are followed on")
     check_counts(k=k)
     if not 2 <= k <= 2 * system.ndof:
-        raise ValueError(
-            f"`k` must be from 2 to {2 * system.ndof}, the dimension of the phase space of {system.name!r}; got {k}."
-        )
+        raise ValueError(f"`k` must be from 2 to {2 * system.ndof}, the dimension of phase space; got {k}.")
     return indicator(orbits, int(k), VOLUME, checked_threshold(below), t_eval, deviations, seed, backend)
 
 

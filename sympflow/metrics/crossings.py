@@ -170,9 +170,7 @@ class _Search:
                 self._locate(t, y, h, crossed, part / parts, (part + 1) / parts, before)
             before = after
 
-    def _locate(
-        self, t: np.ndarray, y: np.ndarray, h: np.ndarray, crossed: np.ndarray, a: float, b: float, before: np.ndarray
-    ) -> None:
+    def _locate(self, t: np.ndarray, y: np.ndarray, h: Any, crossed: Any, a: float, b: float, before: Any) -> None:
         """Bisect all crossings together, in the fraction of the step."""
         y, t, h, sign = y[crossed], t[crossed], h[crossed], np.sign(before[crossed])
         low, high = np.full(len(y), a), np.where(sign == 0, a, b)

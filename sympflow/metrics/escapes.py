@@ -135,9 +135,7 @@ def region_of(outside: Any, system: HamiltonianSystem) -> Outside:
     if contains is not None:
         return lambda y: ~contains(y)
     if not callable(outside):
-        raise TypeError(
-            f"`outside` must be a radius, a domain, or a function of states (..., 2d); got {type(outside).__name__}."
-        )
+        raise TypeError(f"`outside` must be a radius, a domain, or a function of states; got {type(outside).__name__}.")
     return outside
 
 

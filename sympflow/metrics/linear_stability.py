@@ -354,9 +354,7 @@ def _quadratic(system: HamiltonianSystem, y0: np.ndarray) -> bool:
     return bool(np.abs(hessians - hessians[0]).max() <= 1e-12 * np.abs(hessians[0]).max())
 
 
-def of_method(
-    integrator: Integrator, system: HamiltonianSystem, small: SmallOscillations, longest: float
-) -> LinearStability | None:
+def of_method(integrator: Integrator, system: HamiltonianSystem, small: Any, longest: float) -> LinearStability | None:
     """Return the steps, up to `longest`, at which a method keeps small oscillations of a system bounded.
 
     Exact for kicks and drifts; for another method with steps on a grid its step at the equilibrium is differentiated,

@@ -339,9 +339,7 @@ class Attempt:
         if sol.success and "domain_exit" in stats:
             self.note(f"The state left the flow's domain at t = {stats['domain_exit']:.4g}.")
 
-    def warm_up(
-        self, run: Callable[[Any, tuple[float, float], np.ndarray], object], t: np.ndarray, t0: float, dt: float
-    ) -> None:
+    def warm_up(self, run: Callable[..., Any], t: np.ndarray, t0: float, dt: float) -> None:
         """Compile what the candidate's runs need, and enter the time that it took; `dt` is a step of the system."""
         integrator = self.candidate.integrator
         if integrator is None:

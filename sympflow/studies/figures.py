@@ -409,9 +409,7 @@ def _shown(row: Row) -> float:
     return LARGEST if error is None or not math.isfinite(error) else min(max(error, SMALLEST), LARGEST)
 
 
-def stability_map(
-    all_rows: Sequence[Row], limits: Mapping[str, Sequence[tuple[float, float]]], missing: Sequence[str]
-) -> Figure:
+def stability_map(all_rows: Sequence[Row], limits: Mapping[str, Any], missing: Sequence[str]) -> Figure:
     """A panel for each method: step against stiffness, coloured by energy error; × where it says nothing."""
     from matplotlib.colors import LogNorm
 
@@ -426,9 +424,8 @@ def stability_map(
         x, y = np.array([r.dt for r in rows]), np.array([r.value for r in rows])
         error = np.array([_shown(r) for r in rows])
         bad = np.array([r.status in ("unstable", "outside") for r in rows])
-        image = ax.scatter(
-            x[~bad], y[~bad], c=np.clip(error[~bad], norm.vmin, norm.vmax), norm=norm, cmap="viridis", marker="s", s=34
-        )
+        shades: dict[str, Any] = {"c": np.clip(error[~bad], norm.vmin, norm.vmax), "norm": norm, "cmap": "viridis"}
+        image = ax.scatter(x[~bad], y[~bad], marker="s", s=34, **shades)
         ax.scatter(x[bad], y[bad], c=UNSTABLE, marker="x", s=22, lw=1.0)
         if line := limits.get(label):
             ax.plot(*zip(*line, strict=True), color="#D55E00", lw=1.4, marker="o" if len(line) == 1 else "", ms=4)
@@ -453,9 +450,7 @@ def stability_map(
 # sections ---------------------------------------------------------------------------------------------------------
 
 
-def section_figure(
-    points: np.ndarray, trajectory: np.ndarray, n_trajectories: int, axes: tuple[str, str], heading: str
-) -> Figure:
+def section_figure(points: np.ndarray, trajectory: np.ndarray, n_trajectories: int, axes: Any, heading: str) -> Figure:
     """Points (n, 2) of a section, each trajectory in a shade of its own."""
     figure = new_figure(4.6, 4.4)
     ax = figure.add_subplot()

@@ -733,7 +733,7 @@ class StabilityReport(Report):
         if kind != "map":
             raise ValueError(f"`kind` must be 'steps' or 'map'; got {kind!r}.")
         if len({row.value for row in self.rows}) < 2:
-            raise ValueError("`kind` 'map' needs systems that differ in a parameter: pass a family to stability().")
+            raise ValueError("`kind` 'map' needs several systems that differ in a parameter: pass a family.")
         lines: dict[str, list[tuple[float, float]]] = {}
         for x in self.limits:
             if x.stable is not None and x.unstable and x.value is not None:

@@ -45,9 +45,7 @@ def start(system: HamiltonianSystem) -> np.ndarray:
     return system.y0
 
 
-def run(
-    integrator: Integrator, system: HamiltonianSystem, t_span: tuple[float, float], y0: Any = None, **arguments: Any
-) -> Solution:
+def run(integrator: Integrator, system: HamiltonianSystem, t_span: Any, y0: Any = None, **arguments: Any) -> Solution:
     """A solution of the integrator's, from the system's y0 unless another is given."""
     y0 = start(system) if y0 is None else y0
     with warnings.catch_warnings():  # the methods of low order are judged by their laws, at any step
@@ -83,9 +81,7 @@ def bare_step(integrator: Integrator, system: HamiltonianSystem) -> str | None:
     return None
 
 
-def _step(
-    integrator: Integrator, system: HamiltonianSystem, t: float = 0.0
-) -> Callable[[np.ndarray, np.ndarray | float], np.ndarray]:
+def _step(integrator: Integrator, system: HamiltonianSystem, t: float = 0.0) -> Callable[[np.ndarray, Any], np.ndarray]:
     reason = bare_step(integrator, system)
     if reason is not None:
         raise NotApplicable(reason)
@@ -474,7 +470,7 @@ def states_within_a_step_belong_to_it(integrator: Integrator, system: Hamiltonia
     if isinstance(integrator, FixedStep) and integrator.on_grid and bare_step(integrator, system) is None:
         with np.errstate(all="ignore"):
             expected = np.asarray(integrator.step(system, 0.0, y, fractions * h))[within]
-        assert_close(inside, expected, 1e4 * EPS, "a state within a step is no shorter step from its start, but away")
+        assert_close(inside, expected, 1e4 * EPS, "a state within a step is not the shorter step there, but away")
         return
     reference = solve(system, "dop853", (0.0, T_END), start(system), dense_output=True, rtol=1e-12, atol=1e-14).sol
     assert reference is not None
