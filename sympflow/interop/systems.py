@@ -149,9 +149,7 @@ def from_module(module: Callable[[Any, Tensor], Tensor], ndof: int, **scene: Any
     return _guarded(system, "module", minus_J_f, probes)
 
 
-def _guarded(
-    system: HamiltonianSystem, argument: str, gradient: Callable[[Tensor], Tensor], probes: Tensor
-) -> HamiltonianSystem:
+def _guarded(system: HamiltonianSystem, argument: str, gradient: Any, probes: Tensor) -> HamiltonianSystem:
     """The system, which compares M⁻¹p with ∂H/∂p at one state whenever it is used."""
     d, state = system.ndof, probes[:1]
     expected = system.velocity(state[:, d:])

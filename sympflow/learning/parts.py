@@ -396,9 +396,7 @@ class Network(Part):
         inputs = []
         for i, kind in self.inputs:
             angle = _float(2 * np.pi / self.periods[i]) * x[i]
-            inputs.append(
-                x[i] / _float(self.scales[i]) if kind == "line" else (sympy.cos if kind == "cos" else sympy.sin)(angle)
-            )
+            inputs.append(x[i] / _float(self.scales[i]) if kind == "line" else getattr(sympy, kind)(angle))
         made = []
         for weight, row, bias in zip(w, a, b, strict=True):
             sum_ = sympy.Add(_float(bias), *(_float(c) * z for c, z in zip(row, inputs, strict=True)))

@@ -195,9 +195,7 @@ def _instants(reference: object, t0: float, t1: float, n: int, dt: float) -> np.
     return attempts.instants(t0, t1, n, dt) if reference is None else np.linspace(t0, t1, n + 1)[1:]
 
 
-def _given(
-    reference: Reference | Solution | ArrayLike, system: HamiltonianSystem, t0: float, y0: np.ndarray, t: np.ndarray
-) -> Reference:
+def _given(reference: Any, system: HamiltonianSystem, t0: float, y0: np.ndarray, t: np.ndarray) -> Reference:
     """The reference that was given, if it is one and fits."""
     if isinstance(reference, Reference | Solution):
         if len(reference.t) != len(t):
