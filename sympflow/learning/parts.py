@@ -126,7 +126,8 @@ class Polynomial(Sum):
     """Σ_m θ_m Π_i (x_i/s_i)^m_i, of exponents m (n, m) and scales s (m,), of the size of the data: θ are comparable."""
 
     def __init__(self, of: str, exponents: Any, scales: Any) -> None:
-        self.of, self.exponents, self.scales = of, np.asarray(exponents, dtype=int), np.asarray(scales, dtype=float)
+        self.of, self.scales = of, np.asarray(scales, dtype=float)
+        self.exponents = np.asarray(exponents, dtype=int).reshape(-1, len(self.scales))
         self.n = len(self.exponents)
         self.quadratic = bool((self.exponents.sum(axis=1) == 2).all())
 
