@@ -8,7 +8,7 @@ import keyword
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import wraps
+from functools import partial, wraps
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -116,16 +116,6 @@ def made(scene: str, **params: Any) -> HamiltonianSystem:
         what = type(system).__name__
         raise ImportError(f"`system` {scene!r} makes no HamiltonianSystem but a {what}: report it where it is from.")
     return system
-
-
-def _making(scene: str) -> Callable[..., HamiltonianSystem]:
-    """`made` of one scene, with the parameters that it has."""
-
-    @wraps(factory_of(scene))
-    def make(**params: Any) -> HamiltonianSystem:
-        return made(scene, **params)
-
-    return make
 
 
 @dataclass(frozen=True)
@@ -286,7 +276,8 @@ def _parted(word: str) -> tuple[str, Callable[..., HamiltonianSystem], list[str]
         close = files or difflib.get_close_matches(last, scene_names(), n=1, cutoff=0.5)
         hint = f"Did you mean {close[0]!r}? Else {SYSTEM}" if close else f"{SYSTEM[0].upper()}{SYSTEM[1:]}"
         raise ValueError(f"`system` {name!r} is unknown. {hint}.")
-    return name, _making(name), [pair for pair in pairs if pair]
+    make: Any = wraps(factory_of(name))(partial(made, name))  # with the parameters that the scene has
+    return name, make, [pair for pair in pairs if pair]
 
 
 def _scene(name: str, factory: Callable[..., HamiltonianSystem], pairs: list[str], shared: dict[str, str]) -> Scene:

@@ -126,7 +126,8 @@ class Polynomial(Sum):
     """Σ_m θ_m Π_i (x_i/s_i)^m_i, of exponents m (n, m) and scales s (m,), of the size of the data: θ are comparable."""
 
     def __init__(self, of: str, exponents: Any, scales: Any) -> None:
-        self.of, self.exponents, self.scales = of, np.asarray(exponents, dtype=int), np.asarray(scales, dtype=float)
+        self.of, self.scales = of, np.asarray(scales, dtype=float)
+        self.exponents = np.asarray(exponents, dtype=int).reshape(-1, len(self.scales))
         self.n = len(self.exponents)
         self.quadratic = bool((self.exponents.sum(axis=1) == 2).all())
 
@@ -396,9 +397,7 @@ class Network(Part):
         inputs = []
         for i, kind in self.inputs:
             angle = _float(2 * np.pi / self.periods[i]) * x[i]
-            inputs.append(
-                x[i] / _float(self.scales[i]) if kind == "line" else (sympy.cos if kind == "cos" else sympy.sin)(angle)
-            )
+            inputs.append(x[i] / _float(self.scales[i]) if kind == "line" else getattr(sympy, kind)(angle))
         made = []
         for weight, row, bias in zip(w, a, b, strict=True):
             sum_ = sympy.Add(_float(bias), *(_float(c) * z for c, z in zip(row, inputs, strict=True)))

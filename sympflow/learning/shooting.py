@@ -290,7 +290,8 @@ class Fit:
 
 def _robust_variances(r: np.ndarray, huber: float) -> np.ndarray:
     """σ² of rows (2d, n) by Huber's proposal 2: the mean of min(r², k²σ²) is that of normal residuals."""
-    expected = _clipped_square(huber)
+    density, inside = math.exp(-huber * huber / 2) / math.sqrt(2 * math.pi), math.erf(huber / math.sqrt(2))
+    expected = inside - 2 * huber * density + huber * huber * (1 - inside)
     made = np.empty(len(r))
     for i, row in enumerate(r):
         squares = row[np.isfinite(row)] ** 2
@@ -301,13 +302,6 @@ def _robust_variances(r: np.ndarray, huber: float) -> np.ndarray:
                 break
         made[i] = variance
     return made
-
-
-def _clipped_square(k: float) -> float:
-    """The mean of min(z², k²) of normal z."""
-    density = math.exp(-k * k / 2) / math.sqrt(2 * math.pi)
-    inside = math.erf(k / math.sqrt(2))
-    return inside - 2 * k * density + k * k * (1 - inside)
 
 
 def minimized(

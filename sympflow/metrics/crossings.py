@@ -132,14 +132,12 @@ class _Search:
             self.search(t, y, h, np.concatenate([y[1:], y_end[None]]))
             to_go = grid.t1 - float(t[-1] + h[-1])
         reached = abs(to_go) < abs(grid.h) / 2 and bool(np.isfinite(y_end).all())
-        status, message = (np.zeros(len(rows), dtype=int), FINISHED) if reached else self._failure(t_span, rows)
+        status, message = np.zeros(len(rows), dtype=int), FINISHED
+        if not reached:  # as `solve` says of the run that could not go on
+            y0, end = rows[0] if len(rows) == 1 else rows, [t_span[1]]
+            sol = solve(self.system, self.integrator, t_span, y0, t_eval=end, on_domain_exit="ignore")
+            status, message = np.broadcast_to(np.asarray(sol.status), len(rows)), sol.message
         return Crossings(*self._located(rows.shape[-1], grid.h), status, message)
-
-    def _failure(self, t_span: tuple[float, float], rows: np.ndarray) -> tuple[np.ndarray, str]:
-        """The status (N,) and the message that `solve` gives the run that could not go on."""
-        y0 = rows[0] if len(rows) == 1 else rows
-        sol = solve(self.system, self.integrator, t_span, y0, t_eval=[t_span[1]], on_domain_exit="ignore")
-        return np.broadcast_to(np.asarray(sol.status), len(rows)), sol.message
 
     def _end(self, grid: Grid, t: np.ndarray, y: np.ndarray, h: np.ndarray) -> np.ndarray:
         """The end (N, 2d) of the last chunk of steps, run again: a single step would differ from it in rounding."""

@@ -158,10 +158,8 @@ def frequencies(
         if not message or (np.asarray(sol.status) < 0).any():
             message = sol.message
     omega, amplitude = (np.concatenate(found) for found in zip(*parts, strict=True))
-    shape = (*orbits.batch, *omega.shape[1:])
-    return Frequencies(
-        omega.reshape(shape), amplitude.reshape(shape), np.concatenate(status).reshape(orbits.batch)[()], message
-    )
+    shape, ended = (*orbits.batch, *omega.shape[1:]), np.concatenate(status).reshape(orbits.batch)[()]
+    return Frequencies(omega.reshape(shape), amplitude.reshape(shape), ended, message)
 
 
 def _sample_times(orbits: Orbits, samples: int | None) -> np.ndarray:

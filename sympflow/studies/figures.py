@@ -118,7 +118,8 @@ def _energy_panel(ax: Axes, comparison: Compared, styles: dict[str, tuple[str, s
     """|energy error| over time: samples faint, their running maximum bold."""
     for run, sol, series in _series(comparison, "energy"):
         colour = styles[run.row.label][0]
-        t, e = sol.t, np.maximum(_middle(series), ROUNDING_FLOOR)
+        middle = np.median(series.reshape(-1, series.shape[-1]), axis=0)  # of a batch
+        t, e = sol.t, np.maximum(middle, ROUNDING_FLOOR)
         ax.plot(t, e, color=colour, lw=0.4, alpha=0.3, zorder=1)
         order = 3 if run.row.method == "sympflow" else 2
         ax.plot(t, np.fmax.accumulate(e), _dash(run), color=colour, lw=1.6, zorder=order)
@@ -158,11 +159,6 @@ def _series(comparison: Compared, name: str) -> list[tuple[Attempt, Solution, np
 def _dash(run: Attempt) -> str:
     """Leapfrog is dashed: its curves lie on Verlet's."""
     return "--" if run.row.method == "leapfrog" else "-"
-
-
-def _middle(series: np.ndarray) -> np.ndarray:
-    """The median over the trajectories of a batch."""
-    return series if series.ndim == 1 else np.median(series.reshape(-1, series.shape[-1]), axis=0)
 
 
 def _drawable(comparison: Compared) -> tuple[str, ...]:
@@ -339,11 +335,12 @@ def precision_figure(rows: Sequence[Row], heading: str, measure: str = "energy_e
 
 def _precision_curve(ax: Axes, points: Sequence[Row], cost: str, measure: str, style: tuple[str, str]) -> None:
     colour, marker = style
-    known = [
-        (error, cost_there, p.status == "uncertain")
-        for p, error, cost_there in ((p, getattr(p, measure), _cost(p, cost)) for p in points)
-        if error and cost_there and error < LEAST_PRECISE
-    ]
+    known = []
+    for p in points:
+        error, counted = getattr(p, measure), (p.force_evaluations or 0.0) + (p.hessian_evaluations or 0.0)
+        spent = p.run_time if cost == "run_time" else counted
+        if error and spent and error < LEAST_PRECISE:
+            known.append((error, spent, p.status == "uncertain"))
     if not known:
         return
     errors, costs, _ = zip(*known, strict=True)
@@ -351,12 +348,6 @@ def _precision_curve(ax: Axes, points: Sequence[Row], cost: str, measure: str, s
     hollow = [(e, c) for e, c, doubt in known if doubt]
     if measure == "error" and hollow:
         ax.plot(*zip(*hollow, strict=True), marker, color="white", mec=colour, ms=5)
-
-
-def _cost(point: Row, cost: str) -> float:
-    if cost == "run_time":
-        return point.run_time or 0.0
-    return (point.force_evaluations or 0.0) + (point.hessian_evaluations or 0.0)
 
 
 # stability ------------------------------------------------------------------------------------------------------------

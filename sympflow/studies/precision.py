@@ -227,12 +227,15 @@ def _measure(
                 break
     say(f"{scene}: timing")
     again = [p for p in points if p.row.status == "ok" and (p.row.run_time or 0.0) * repeats <= budget]
-    times = interleaved([partial(conditions.run, p.candidate.integrator) for p in again], repeats)
-    for point, run_time in zip(again, times, strict=True):
+    timed = interleaved([partial(conditions.run, p.candidate.integrator) for p in again], repeats)
+    for point, run_time in zip(again, timed, strict=True):
         point.fill(run_time=run_time.median, run_time_spread=run_time.spread, repeats=repeats)
     for point in points:
         if point.sol is not None and (few := point.sol.y0.size // point.sol.y0.shape[-1]) < conditions.trajectories:
-            _scale(point, few, conditions.trajectories)
+            times = {name: getattr(point.row, name) for name in ("run_time", "run_time_spread")}
+            share = conditions.trajectories / few
+            point.fill(**{name: None if x is None else x * share for name, x in times.items()})
+            point.note(f"Timed on {few} trajectories, which the method takes one by one.")
         if point.row.status == "ok" and truth is not None and not (point.row.error or 0.0) >= resolved:
             point.fill(status="uncertain")
     return [point.row for point in points], truth
@@ -257,13 +260,6 @@ def _first(candidate: Candidate, conditions: Conditions, compile_time: float | N
     if conditions.measure in _KEPT:
         point.measure({"energy": _KEPT[conditions.measure]}, ["energy"])
     return point
-
-
-def _scale(point: Attempt, few: int, all_of_them: int) -> None:
-    """Scale the run time of a few trajectories to all of them."""
-    times = {"run_time": point.row.run_time, "run_time_spread": point.row.run_time_spread}
-    point.fill(**{name: None if x is None else x * (all_of_them / few) for name, x in times.items()})
-    point.note(f"Timed on {few} trajectories, which the method takes one by one.")
 
 
 SETTINGS = ("dt", "tolerance")  # settings of a method: the largest that reaches an error is the cheapest

@@ -316,7 +316,8 @@ class Study:
         one.fill(dt=h)
         if one.sol is not None:
             with one.noting_warnings():
-                one.fill(energy_error=largest_error(one.sols))
+                worst = [float(np.max(max_energy_error(sol))) for sol in one.sols]
+                one.fill(energy_error=math.inf if any(map(math.isnan, worst)) else max(worst))
             status, words = self.verdict(one)
             one.fill(status=status, reason=f"{one.row.reason} {words}".strip())
         return one
@@ -363,12 +364,6 @@ def _quiet() -> Iterator[None]:
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore", RuntimeWarning)
         yield
-
-
-def largest_error(sols: Sequence[Solution]) -> float:
-    """The largest energy error over states and outputs, inf where a run failed or is not finite."""
-    worst = [float(np.max(max_energy_error(sol))) for sol in sols]
-    return math.inf if any(math.isnan(x) for x in worst) else max(worst)
 
 
 def domain_exit(sols: Sequence[Solution]) -> float | None:

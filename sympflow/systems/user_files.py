@@ -83,7 +83,11 @@ def factory(path: str | os.PathLike[str], name: str | None = None) -> Callable[.
     file = Path(path)
     if file.suffix == ".toml":
         return _of_toml(file, name)
-    module = _module(file)
+    _text(file)
+    try:
+        module = _run(file.resolve())
+    except (Exception, SystemExit) as error:
+        raise ValueError(f"`system` {str(file)!r} cannot be run ({_described(error, file)}): mend it.") from error
     if name is None:
         names = _candidates(module)
         if len(names) == 1:
@@ -225,14 +229,6 @@ def _text(file: Path) -> str:
         raise ValueError(f"`system` {str(file)!r} cannot be read ({error.strerror}): name a file that can.") from error
     except UnicodeDecodeError as error:
         raise ValueError(f"`system` {str(file)!r} is not a text in UTF-8: save it in UTF-8.") from error
-
-
-def _module(file: Path) -> ModuleType:
-    _text(file)
-    try:
-        return _run(file.resolve())
-    except (Exception, SystemExit) as error:
-        raise ValueError(f"`system` {str(file)!r} cannot be run ({_described(error, file)}): mend it.") from error
 
 
 @cache
