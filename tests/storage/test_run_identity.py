@@ -260,7 +260,7 @@ def test_drawn_states_are_all_compared(tmp_path):
         return draw
 
     def run(last, **how):
-        how = {"n": 4096, "dt": 0.5, "reduce": "final", "store": tmp_path / "a"} | how
+        how = {"n": 4096, "dt": 0.1, "reduce": "final", "store": tmp_path / "a"} | how
         return sympflow.ensemble(sympflow.systems.henon_heiles(), "verlet", (0, 1), sampler(last), **how)
 
     run(0.0)
