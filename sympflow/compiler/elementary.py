@@ -2,7 +2,7 @@
 
 Each function reduces its argument by an identity, which a comment states, and evaluates a polynomial by Estrin's rule.
 What few arguments need, very large ones for instance, is given by the C library, one lane after the other, behind a
-branch that others never take. float32 is computed in double precision.
+branch that others never take.
 
 Errors in units in the last place, for all arguments: below 1 for exp and log, 3 for tanh, 2 for expm1, log1p, atan and
 powers; up to `FAR` 2 for sin, cos and tan, 3 on machines without fused operations. Angles beyond `FAR` have the errors
@@ -51,9 +51,6 @@ def _lowered(name: str, inline: int = INLINE) -> Callable[[Callable[..., Value]]
     def register(build: Callable[..., Value]) -> Callable[..., Value]:
         def lowered(*args: Any) -> Value:
             x: Value = args[0]
-            if x.type.scalar == "float":
-                wide = [x.code.convert("fpext", a, "double") if isinstance(a, Value) else a for a in args]
-                return x.code.convert("fptrunc", lowered(*wide), "float")
             full = f"{name}.{x.type.suffix}"
             if x.code.module.used(full) <= inline:
                 return build(*args)

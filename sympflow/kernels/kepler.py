@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.compiler import NotCompiled
+from sympflow.compiler import NotCompiled, arrays_only
 from sympflow.compiler.control import INT, Type, Value
 from sympflow.compiler.dual import Dual
 from sympflow.compiler.functions import where
@@ -512,9 +512,8 @@ class KeplerLoops:
     def __init__(self, frame: Frame) -> None:
         n, light = len(frame.order), places_of_light(frame)
         if not n or n > MOST_GROUPS * LANES - 1:
-            raise NotCompiled(
-                f"`system` has {n} planets with a mass, and compiled code is for 1 to {MOST_GROUPS * LANES - 1}: use "
-                "backend='array'."
+            raise arrays_only(
+                f"`system` has {n} planets with a mass, and compiled code is for 1 to {MOST_GROUPS * LANES - 1}"
             )
         self.frame, self._light = frame, light
         self._codes: dict[tuple[Form, int, int], KeplerCode] = {}

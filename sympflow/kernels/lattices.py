@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from sympflow.compiler import NotCompiled
+from sympflow.compiler import arrays_only
 from sympflow.compiler.arrange import ALWAYS, Arrangement
 from sympflow.compiler.control import INT, Sweep, Type, Value
 from sympflow.compiler.functions import FUNCTIONS, added, is_zero, times
@@ -913,9 +913,7 @@ class LatticeCode(SharedRollouts):
         self, lattice: LatticeHamiltonian, damped: bool, level: int, compensated: bool, monomials: Monomials = ()
     ) -> None:
         if level == POLYNOMIAL:
-            raise NotCompiled(
-                "`scheme` has polynomials, which are of systems by their coordinates one by one: use backend='array'."
-            )
+            raise arrays_only("`scheme` has polynomials, which are of systems by their coordinates one by one")
         super().__init__(2 * lattice.ndof * (1 + compensated), 2 * lattice.ndof)
         self._given = lattice, damped, level, compensated
         self._order, width = arrangement(lattice)

@@ -11,7 +11,7 @@ from weakref import ref
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.compiler import NotCompiled
+from sympflow.compiler import NotCompiled, arrays_only
 from sympflow.hamiltonian.formulas import TracedDriving, TracedHamiltonian
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.system import HamiltonianSystem
@@ -80,9 +80,7 @@ class SplittingLoops:
 
                 self._driving = driven_form(symbols if self._large else symbols.parametric)
                 if self._large and self._driving.means:
-                    raise NotCompiled(
-                        "`system` has many terms and a kinetic energy that depends on t: use backend='array'."
-                    )
+                    raise arrays_only("`system` has many terms and a kinetic energy that depends on t")
                 self._driving.check()
                 self._form = self._driving.form
                 self.values, self.traced = self._form.values, True
@@ -115,10 +113,7 @@ class SplittingLoops:
             self._compile = partial(function_code, system.ndof, *given, ndim)
         elif (local := cast(Any, system.local)) is not None:
             if system.damping is not None and system.damping.ndim:
-                raise NotCompiled(
-                    f"`system` {system.name!r} has friction, and its loops take one rate for all momenta: use "
-                    "backend='array'."
-                )
+                raise arrays_only(f"`system` {system.name!r} has friction, and its loops take one rate for all momenta")
             if local.arrays_only:
                 raise NotCompiled(f"`system` has {local.arrays_only}, whose kicks are array operations: use 'array'.")
             if local.loops == "pairs":
@@ -134,9 +129,7 @@ class SplittingLoops:
             self.traced = self._written is not None
         elif system.layered is not None:
             if system.friction:
-                raise NotCompiled(
-                    f"`system` {system.name!r} has friction, and weights that torch follows: use backend='array'."
-                )
+                raise arrays_only(f"`system` {system.name!r} has friction, and weights that torch follows")
             self._has_force_gradient, self.tensors = False, system.layered.tensors
             self.work = system.layered.n_weights
             from sympflow.kernels.layered_splittings import LayeredCode
