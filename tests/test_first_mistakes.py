@@ -1,11 +1,14 @@
 """Natural first calls: what is meant is done, or the error names the remedy."""
 
 import importlib
+import math
+import pickle
 import warnings
 
 import numpy as np
 import pytest
 import sympy as sp
+from scipy.special import ellipk
 from sympy.physics.mechanics import dynamicsymbols
 
 import sympflow
@@ -76,6 +79,10 @@ def test_functions_of_the_time_are_coordinates():
     assert H(pr**2 / 2 + k / r, q=[r], p=[pr], params={k: 2}).expression == H("p**2/2 + 2/q").expression
 
 
+def ran():
+    return solve(SPRING, "verlet", (0, 1), [1, 0], dt=0.1)
+
+
 ANSWERED = {
     "lambda": (lambda: solve(lambda q, p: p**2), TypeError, r"`system` .* HamiltonianSystem\(hamiltonian=f, ndof=d\)"),
     "factory": (lambda: solve(systems.pendulum), TypeError, r"`system` .* call it, pendulum\(\)"),
@@ -136,6 +143,49 @@ ANSWERED = {
     "an event of y": (lambda: solve(SPRING, y0=[1, 0], events=lambda y: y), TypeError, r"Write g\(t, y\)"),
     "Tsit5": (lambda: sympflow.get("Tsit5"), ValueError, "'dop853'"),
     "symplectic": (lambda: sympflow.get("symplectic"), ValueError, "'srkn11b', or 'kahan_li8'"),
+    "no dense output": (lambda: ran().sol(3), TypeError, "`sol` is for runs with dense output: pass dense_output=True"),
+    "sol[0]": (lambda: ran()[0], TypeError, r"`sol` has no item 0: take `sol.t`, `sol.y`"),
+    "t, y = sol": (lambda: list(ran()), TypeError, r"as in t, y = sol.t, sol.y"),
+    "sol.q1": (lambda: ran().q1, AttributeError, r"'q1': take `q\[..., i, :\]`"),
+    "plot(kind=)": (lambda: ran().plot(kind="phase"), TypeError, r"`kind` .* of plot\(\).*: did you mean `kinds`\?"),
+    "no system": (
+        lambda: solve(t_span=(0, 1)),
+        TypeError,
+        r"`system` is missing: give it, solve\(system, method, t_span",
+    ),
+    "dt by place": (lambda: solve(SPRING, "verlet", (0, 1), [1, 0], 0.1), TypeError, r"after `y0` are given by name"),
+    "y0 twice": (lambda: solve(SPRING, "verlet", (0, 1), [1, 0], y0=[1, 0]), TypeError, "`y0` is given twice"),
+    "no tol": (lambda: sympflow.choose_step(SPRING, "verlet"), TypeError, "`tol` is missing: give it, choose_step"),
+    "compare(tol=)": (lambda: sympflow.compare(SPRING, ["verlet"], tol=1), TypeError, "`tol` .*sympflow.choose_step"),
+    "repeat": (lambda: sympflow.compare(SPRING, ["verlet"], repeat=1), TypeError, "did you mean `repeats`"),
+    "with_params of a dict": (lambda: H(SPRING).with_params({"k": 1}), TypeError, r"with_params\(\) are given by name"),
+    "force of a number": (
+        lambda: H(SPRING).force(1.0),
+        TypeError,
+        r"`q` must be an array or a tensor, positions; got 1.0",
+    ),
+    "H of a solution": (lambda: H(SPRING).hamiltonian(ran()), TypeError, "got Solution: pass .*`sol.states`"),
+    "H of sol.y": (lambda: H(SPRING).hamiltonian(ran().y), ValueError, "Of a solution pass `sol.states`"),
+    "kepler(mu=)": (lambda: systems.kepler(mu=2), TypeError, r"`mu` .*kepler\(\), which takes e: write your own H"),
+    "fput_beta(N=)": (lambda: systems.fput_beta(N=9), TypeError, "`N` .* takes n, beta, amplitude: did you mean `n`"),
+    "pendulum(dt=)": (lambda: systems.pendulum(dt=0.1), TypeError, r"which takes none: pass it to solve\(\)"),
+    "pendulum(1)": (lambda: systems.pendulum(1), TypeError, "`pendulum` takes no arguments: leave the others out"),
+    "dt0": (lambda: solve(SPRING, "verlet", y0=[1, 0], dt0=1), TypeError, "the step of fixed-step methods is `dt`"),
+    "tspan": (lambda: solve(SPRING, "verlet", y0=[1, 0], tspan=1), TypeError, "did you mean `t_span`"),
+    "abstol": (lambda: solve(SPRING, "rk45", y0=[1, 0], abstol=1), TypeError, "are `rtol` and `atol`"),
+    "dt of rk45": (lambda: solve(SPRING, "rk45", y0=[1, 0], dt=1), TypeError, "chooses its own steps: give `rtol`"),
+    "flow=": (lambda: solve(SPRING, "verlet", y0=[1, 0], flow=1), TypeError, "is given in the place of a method"),
+    "n_workers": (lambda: solve(SPRING, y0=[1, 0], n_workers=2), TypeError, "sympflow.ensemble has `workers`"),
+    "epochs": (
+        lambda: sympflow.train("pendulum", epochs=3),
+        TypeError,
+        r"`budget`, in seconds, .*Adam\(steps=\.\.\.\)",
+    ),
+    "from_sympy(V=)": (lambda: H(SPRING, V=1), TypeError, "a potential is `potential`"),
+    "from_sympy(k=)": (lambda: H("p**2/2 + k*q**2", k=1), TypeError, "values of symbols are `params`"),
+    "from_sympy(tspan=)": (lambda: H(SPRING, tspan=1), TypeError, "did you mean `t_span`"),
+    "any case": (lambda: systems.Kepler, AttributeError, "Did you mean 'kepler'"),
+    "system.train": (lambda: H(SPRING).train, AttributeError, r"take sympflow.train\(system\)"),
     "scene": (lambda: systems.henon, AttributeError, "Did you mean 'henon_heiles'"),
 }
 
@@ -144,6 +194,26 @@ ANSWERED = {
 def test_the_answer_names_the_remedy(call, kind, answer):
     with pytest.raises(kind, match=answer):
         call()
+
+
+def test_a_solution_without_dense_output_has_a_false_one():
+    assert not ran().sol
+    assert solve(SPRING, "verlet", (0, 1), [1, 0], dt=0.1, dense_output=True).sol
+
+
+@pytest.mark.parametrize("function", [solve, systems.kepler, sympflow.lyapunov])
+def test_functions_are_pickled_by_name(function):
+    assert pickle.loads(pickle.dumps(function)) is function
+
+
+@pytest.mark.parametrize("end", [100, math.inf])
+def test_a_tolerance_chooses_the_step_of_a_run_that_an_event_ends(end):
+    def turns(t, y):
+        return y[1]
+
+    turns.terminal, turns.direction = True, 1
+    sol = solve("pendulum", "srkn11b", (0, end), [1.0, 0.0], events=turns, tol=1e-12)
+    np.testing.assert_allclose(sol.t_events[0], 2 * ellipk(np.sin(0.5) ** 2), rtol=1e-12)
 
 
 def test_states_in_the_place_of_times_are_told():
@@ -271,6 +341,54 @@ def test_names_of_other_rooms_are_told(name, home):
 def test_a_tolerance_below_single_precision_is_refused():
     with pytest.raises(ValueError, match="`tol` 1e-09 is below the rounding of single precision: compute in float64"):
         sympflow.solve(sympflow.systems.henon_heiles(), "kahan_li8", (0, 10), tol=1e-9, dtype="float32")
+
+
+KEPLER = "(p1**2 + p2**2)/2 - 1/sqrt(q1**2 + q2**2)", [0.1, 0, 0, 4.3588989435406735]
+
+
+@pytest.mark.parametrize(
+    ("method", "options", "told"),
+    [
+        ("log_leapfrog", {"dt": 20.0}, "`dt` 20 is too long for method 'log_leapfrog': with half of it the run ends"),
+        ("log_kahan_li8", {"dt": 5.0}, "`dt` 5 is too long for method 'log_kahan_li8': with half of it the run ends"),
+        ("log_blanes_moan4", {"dt": 20.0}, "`dt` 20 is too long for method 'log_blanes_moan4': the energy"),
+        ("rk45", {}, "`rtol` is too large for method 'rk45': the energy of the run is off by .* Take rtol=1e-8"),
+        ("dop853", {}, "`rtol` is too large for method 'dop853': the energy of the run is off by"),
+    ],
+)
+def test_every_method_whose_steps_are_too_long_is_doubted(method, options, told):
+    H0, y0 = KEPLER if method != "dop853" else ("p**2/2 + q**2/2", [1, 0])
+    end = 20 if options else 100 if method == "rk45" else 2000
+    with pytest.warns(RuntimeWarning, match=told):
+        solve(H(H0, y0=y0), method, (0, end), **options)
+    fine = {"rtol": 1e-8, "atol": 1e-10} if not options else {"dt": 0.05}
+    solve(H(H0, y0=y0), method, (0, 20), **fine)  # in silence
+
+
+@pytest.mark.parametrize(
+    "run",
+    [
+        lambda system, y0: sympflow.ensemble(system, "verlet", (0, 100), y0=y0, dt=0.55, reduce="energy_error"),
+        lambda system, y0: sympflow.ensemble(system, "rk45", (0, 100), y0=y0, t_eval=[100.0], rtol=0.1, atol=0.1),
+        lambda system, y0: sympflow.lyapunov(system, "verlet", (0, 100), y0, dt=0.55),
+        lambda system, y0: sympflow.sali(system, "verlet", (0, 100), y0, dt=0.55),
+        lambda system, y0: sympflow.poincare_section(system, "verlet", (0, 100), y0, coordinate="p", dt=0.55),
+        lambda system, y0: sympflow.escape_times(system, "verlet", (0, 100), y0, outside=5.0, dt=0.55),
+        lambda system, y0: sympflow.frequencies(system, "verlet", (0, 100), y0, dt=0.55),
+        lambda system, y0: solve(system, "verlet", (0, 100), y0, params={"k": [1.0, 1.1]}, dt=0.55),
+    ],
+)
+def test_orbits_of_which_no_states_are_kept_are_doubted_too(run):
+    system = H("p**2/2 + k*(q**2 - 1)**2/4", y0=[1.5, 0], params={"k": 1.0})
+    with pytest.warns(RuntimeWarning, match=r"is too l.* for method .*: the energy of the run is off by"):
+        run(system, np.array([[1.5, 0.0], [1.6, 0.0]]))
+
+
+def test_orbits_that_leap_over_a_wall_by_the_default_step_are_told():
+    system = H("p**2/2 + 4*(q**-12 - q**-6)", y0=[50, -10])
+    with pytest.warns(RuntimeWarning, match=r"`system`: .* passed q1 = 0, where H is infinite"):
+        sympflow.ensemble(system, "verlet", (0, 20), y0=[[50, -10], [40, -8]])
+    assert solve(system, "verlet", (0, 20)).status == -1
 
 
 @pytest.mark.parametrize("dt", [0.5, 3.0, 100.0])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
@@ -14,9 +14,10 @@ from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
 from sympflow.arguments import plain, real_number
+from sympflow.compiler import NotCompiled
 from sympflow.flow.families import family
 from sympflow.flow.flow_map import FlowMap
-from sympflow.flow.layers import LAYERS, Binding, Drift, Kick, Layer
+from sympflow.flow.layers import LAYERS, Binding, Drift, Kick, Layer, PotentialLayer
 from sympflow.flow.potentials import (
     MLPPotential,
     Potential,
@@ -169,23 +170,23 @@ class SympFlow(FlowMap):
         scale = Scaling.unit(self.ndof, self.dt) if scale is None else scale
         generator = torch.Generator().manual_seed(plain(seed))
         features = 0 if drive is None else drive.size
-
-        def potential(unit: tuple[float, ...], center: tuple[float, ...]) -> MLPPotential:
-            return MLPPotential(
-                self.ndof,
-                hidden,
-                activation,
-                scale=unit,
-                center=center,
-                tau=scale.t,
-                gain=scale.action,
-                features=features,
-                dtype=dtype,
-                device=device,
-                generator=generator,
-            )
-
-        self.layers = _pairs_of_layers(self.ndof, pairs, hidden, scale, potential, features)
+        pairs, widths = plain(pairs), hidden_widths(hidden)
+        if isinstance(pairs, bool) or not isinstance(pairs, int) or pairs < 1:
+            raise ValueError(f"`pairs` must be a positive integer, the number of kick–drift pairs; got {pairs!r}.")
+        if len(scale.q) != ndof:
+            raise ValueError(f"`scale` is for {len(scale.q)} degrees of freedom, not {ndof}: give one entry for each.")
+        if 2 * pairs > MAX_LAYERS:
+            raise ValueError(f"`pairs` must be at most {MAX_LAYERS // 2}, as many as a file may hold; got {pairs!r}.")
+        weights = 2 * pairs * count_weights(self.ndof + features, widths)
+        check_memory(f"`hidden` {widths!r} with `pairs` {pairs}", weights, "take narrower layers, or fewer pairs")
+        like: dict[str, Any] = {"tau": scale.t, "gain": scale.action, "features": features, "generator": generator}
+        like |= {"dtype": dtype, "device": device}
+        units = {Kick: (scale.q, scale.q_center), Drift: (scale.p, scale.p_center)}
+        self.layers = nn.ModuleList(
+            layer(MLPPotential(self.ndof, widths, activation, scale=unit, center=center, **like))
+            for _ in range(pairs)
+            for layer, (unit, center) in units.items()
+        )
 
     @classmethod
     def from_layers(cls, layers: Iterable[Layer], dt: float, drive: Drive | None = None) -> Self:
@@ -555,19 +556,31 @@ class SympFlow(FlowMap):
     def _compiled(self) -> MLPFlowKernel:
         from sympflow.kernels.networks import MLPFlowKernel
 
-        networks = [layer.network() for layer in self.layers]  # type: ignore[operator]
+        if not (potentials := self._potentials()):
+            raise NotCompiled("`flow` has layers other than kicks and drifts with MLP potentials: use backend='array'.")
+        networks = [V.network(is_kick) for is_kick, V in potentials]
         check_compilable(self.dtype, self.device)
         return MLPFlowKernel(self.ndof, networks)
 
     def tangents(self) -> NetworkTangents | None:
         from sympflow.kernels.network_tangents import NetworkTangents
 
-        networks = [layer.trained() for layer in self.layers]  # type: ignore[operator]
-        if None in networks or len({(n.inputs, n.widths, n.activation) for n in networks}) > 1:
+        potentials = self._potentials()
+        networks = [network for _, V in potentials if (network := V.trained()) is not None]
+        alike = len({(n.inputs, n.widths, n.activation) for n in networks}) == 1
+        if not alike or len(networks) < len(potentials):
             return None
-        return NetworkTangents(self.ndof, [layer.kind == "kick" for layer in self.layers], networks)
+        return NetworkTangents(self.ndof, [is_kick for is_kick, _ in potentials], networks)
+
+    def _potentials(self) -> list[tuple[bool, MLPPotential]]:
+        """The potentials of its kicks, with True, and drifts; none where a layer is of another kind."""
+        layers: list[Any] = list(self.layers)
+        if not all(isinstance(x, PotentialLayer) and isinstance(x.potential, MLPPotential) for x in layers):
+            return []
+        return [(layer.kind == "kick", layer.potential) for layer in layers]
 
     def step_constants(self, x: Tensor, *t0: Tensor) -> Tensor:
+        """The constants of a step from states (N, 2d) that its networks take beside these and t: (m, N)."""
         return self._opened(self._columns(0.0, self.lift(x, *t0))[1], 0.0)[0][self.ndof :]
 
     def hamiltonian_unchecked(self, t: float | Tensor, x: Tensor, t0: Any = None) -> Tensor:
@@ -684,31 +697,6 @@ class SystemFlow(SympFlow):
     def _compiled_for(self, system: HamiltonianSystem, compensated: bool) -> Kernel:
         """The compiled loops of the flow on a system."""
         raise NotImplementedError
-
-
-def _pairs_of_layers(
-    ndof: int,
-    pairs: Any,
-    hidden: Sequence[int],
-    scale: Scaling,
-    potential: Callable[[tuple[float, ...], tuple[float, ...]], Potential],
-    features: int,
-) -> nn.ModuleList:
-    """Return pairs of a kick and a drift, with potentials made of a unit and a center of q or p; all is checked."""
-    pairs = plain(pairs)
-    if isinstance(pairs, bool) or not isinstance(pairs, int) or pairs < 1:
-        raise ValueError(f"`pairs` must be a positive integer, the number of kick–drift pairs; got {pairs!r}.")
-    if len(scale.q) != ndof:
-        raise ValueError(f"`scale` is for {len(scale.q)} degrees of freedom, not {ndof}: give one entry for each.")
-    if 2 * pairs > MAX_LAYERS:
-        raise ValueError(f"`pairs` must be at most {MAX_LAYERS // 2}, as many as a file may hold; got {pairs!r}.")
-    weights = 2 * pairs * count_weights(ndof + features, widths := hidden_widths(hidden))
-    check_memory(f"`hidden` {widths!r} with `pairs` {pairs}", weights, "take narrower layers, or fewer pairs")
-    return nn.ModuleList(
-        layer
-        for _ in range(pairs)
-        for layer in (Kick(potential(scale.q, scale.q_center)), Drift(potential(scale.p, scale.p_center)))
-    )
 
 
 def _drive_of(told: Any) -> Drive | None:

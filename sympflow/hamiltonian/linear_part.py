@@ -70,7 +70,6 @@ class LinearPart(NormalModes):
     center: np.ndarray  # c (d,): where the forces along stiff directions vanish, of a system given by functions
     potential: Any = None  # U(q), what V has beside the quadratic part, if the system is symbolic
     interval: float = 0.0  # length of the system's default interval
-
     dense: ClassVar[bool] = True
     """False of modes by fast transforms, which have no loops."""
 

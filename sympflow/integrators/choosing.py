@@ -40,7 +40,6 @@ ENOUGH, MOST = 0.2, 0.7  # of the tolerance: errors with which a step is taken
 NEAR_POLE = tuple(10.0**-k for k in range(1, 7))
 LOGARITHMIC = 0.9  # ratio of differences of V at these distances from a pole, at least: of a logarithm 1
 NEWTON_STEPS, MOST_CENTERS = 8, 12  # of places that are looked for, and coordinates of the motion
-
 Candidate = tuple[str, str]  # the name of a method, and why it is chosen
 CHOSEN_WITH = {"wisdom_holman": {"corrector": 17}}  # options of methods that are chosen
 RTOL = 1e-9  # of an adaptive method that is chosen
@@ -276,7 +275,8 @@ def step_for(integrator: Integrator, problem: Problem, tol: float, tol_of: str =
     system = with_start(integrator, problem.system.between_impulses, states)
     length = abs(problem.t1 - problem.t0)
     step = float(with_step(integrator, system, states).step_length(system) or system.dt)
-    error = _error(integrator, replace(problem, system=system, y0=states), tol_of, TRIAL_LENGTH * step)
+    trial = replace(problem, system=system, y0=states, events=None)
+    error = _error(integrator, trial, tol_of, TRIAL_LENGTH * step)
     check_applies(integrator, system, states)
     most = min(length, integrator.longest_step(system))
     h = min(step, most)
@@ -340,7 +340,7 @@ def _error(integrator: FixedStep, problem: Problem, tol_of: str, trial: float) -
 
     def error(h: float) -> float:
         n = max(TRIAL_STEPS, min(math.ceil(trial / h), MOST_TRIAL_STEPS) if compiled else 0)
-        n = max(1, min(n, math.ceil(length / h)))
+        n = max(1, math.ceil(min(n, length / h)))
         end, n = min(n * h, length), -(-n // -(-n // TRIAL_STEPS))
         t, y = run(h, end, n)
         times = np.broadcast_to(t.reshape(-1, *[1] * (y0.ndim - 1)), y.shape[:-1])
