@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from sympflow.arguments import plain
 from sympflow.arrays import jvp
-from sympflow.compiler import NotCompiled, arrays_only
+from sympflow.compiler import arrays_only
 from sympflow.flow.weights import check_memory, checked_device, checked_dtype
 from sympflow.lazy import announced, distribution, load_announced
 
