@@ -361,9 +361,7 @@ class Arrangement:
                 lambda: self.operation("fma", x.write(), A.write(), B.write()),
             )
             yield Plan(
-                max(both + PRODUCT, B.depth) + SUM,
-                operations + 2,
-                lambda: self.operation("add", product(), B.write()),
+                max(both + PRODUCT, B.depth) + SUM, operations + 2, lambda: self.operation("add", product(), B.write())
             )
 
     def _one(self, m: Monomial, c: Any) -> Plan:

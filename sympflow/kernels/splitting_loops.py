@@ -241,12 +241,7 @@ class SplittingLoops:
         return position_ranges(system.symbols, system.domain)
 
     def rows(
-        self,
-        table: StageTable,
-        h: float = 1.0,
-        t0: float = 0.0,
-        varied: bool = False,
-        ranges: Ranges | None = None,
+        self, table: StageTable, h: float = 1.0, t0: float = 0.0, varied: bool = False, ranges: Ranges | None = None
     ) -> np.ndarray:
         """The numbers of a table that the loops read, with values, maps of friction, the times of a driven system."""
         if self.friction:
