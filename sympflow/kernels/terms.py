@@ -19,6 +19,7 @@ from sympflow.compiler.functions import is_zero
 from sympflow.compiler.program import Program, gradient, tangent, traced
 from sympflow.hamiltonian.formulas import evaluator
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
+from sympflow.lazy import kept
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT
 
 __all__ = ["Family", "Terms", "families", "is_large", "is_long", "written_out"]
@@ -35,6 +36,7 @@ def is_large(symbols: SymbolicHamiltonian) -> bool:
     return symbols.ndof > MOST_IN_REGISTERS or written_out(symbols.H, symbols.q + symbols.p) > MOST_WRITTEN_OUT
 
 
+@kept
 def is_long(symbols: SymbolicHamiltonian, level: int) -> bool:
     """True where kicks of a level have more operations than are written out, common subexpressions counted once."""
     known, operations, variables, terms = set(symbols.q), set(), 0, sp.Add.make_args(symbols.V)
