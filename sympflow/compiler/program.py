@@ -105,14 +105,6 @@ MOST_ROOTS = 8.5  # powers that are written as powers of a root
 _COMMUTE = {"add", "mul", "times", "min", "max", "eq", "and", "or"}
 
 
-def _sum(a: Any, b: Any) -> Any:
-    return b if _is(a, 0.0) else a if _is(b, 0.0) else None
-
-
-def _difference(a: Any, b: Any) -> Any:
-    return a if _is(b, 0.0) else -b if _is(a, 0.0) else 0.0 if a is b else None
-
-
 def _product(a: Any, b: Any, name: str = "mul") -> Any:
     for x, y in ((a, b), (b, a)):
         if isinstance(x, float):
@@ -134,10 +126,6 @@ def _quotient(a: Any, b: Any) -> Any:
     if isinstance(b, float) and b != 0:
         return a * (1.0 / b) if _halves(b) else None  # exact
     return 0.0 if _is(a, 0.0) else None
-
-
-def _negative(a: Any) -> Any:
-    return a.args[0] if a.name == "neg" else a.args[1] - a.args[0] if a.name == "sub" else None
 
 
 def _power(x: Any, n: Any) -> Any:
@@ -168,12 +156,12 @@ def _choice(condition: Any, a: Any, b: Any) -> Any:
 
 
 _SIMPLER: dict[str, Callable[..., Any]] = {
-    "add": _sum,
-    "sub": _difference,
+    "add": lambda a, b: b if _is(a, 0.0) else a if _is(b, 0.0) else None,
+    "sub": lambda a, b: a if _is(b, 0.0) else -b if _is(a, 0.0) else 0.0 if a is b else None,
     "mul": _product,
     "times": lambda a, b: _product(a, b, "times"),
     "div": _quotient,
-    "neg": _negative,
+    "neg": lambda a: a.args[0] if a.name == "neg" else a.args[1] - a.args[0] if a.name == "sub" else None,
     "pow": _power,
     "fma": _fused,
     "where": _choice,

@@ -237,10 +237,6 @@ def _not(x: Any) -> Any:
     return apply("not", x)
 
 
-def _heaviside(x: Any, at_zero: Any) -> Any:
-    return _choose(apply("eq", x, 0.0), at_zero, _choose(apply("lt", 0.0, x), 1.0, 0.0))
-
-
 def _truncated(x: Any) -> Any:
     return _choose(apply("lt", x, 0.0), -apply("floor", -x), apply("floor", x))
 
@@ -252,10 +248,6 @@ def _nearest(x: Any) -> Any:
 
 def _logaddexp(x: Any, y: Any) -> Any:
     return apply("max", x, y) + apply("log1p", apply("exp", -abs(x - y)))
-
-
-def _sigmoid(x: Any) -> Any:
-    return 1.0 / (1.0 + apply("exp", -x))
 
 
 def _softplus(x: Any) -> Any:
@@ -305,8 +297,9 @@ ELEMENTS: dict[str, Callable[..., Any]] = {
     "isfinite": lambda x: apply("lt", abs(x), math.inf),
     "deg2rad": lambda x: x * (math.pi / 180), "radians": lambda x: x * (math.pi / 180),
     "rad2deg": lambda x: x * (180 / math.pi), "degrees": lambda x: x * (180 / math.pi),
-    "copysign": lambda x, y: abs(x) * _choose(apply("lt", y, 0.0), -1.0, 1.0), "heaviside": _heaviside,
-    "logaddexp": _logaddexp, "expit": _sigmoid, "log_expit": lambda x: -_softplus(-x),
+    "copysign": lambda x, y: abs(x) * _choose(apply("lt", y, 0.0), -1.0, 1.0),
+    "heaviside": lambda x, zero: _choose(apply("eq", x, 0.0), zero, _choose(apply("lt", 0.0, x), 1.0, 0.0)),
+    "logaddexp": _logaddexp, "expit": lambda x: 1.0 / (1.0 + apply("exp", -x)), "log_expit": lambda x: -_softplus(-x),
     "xlogy": lambda x, y: _choose(apply("eq", x, 0.0), 0.0, x * apply("log", y)),
     **{name: _of(name) for name in OF_SCIPY}, **{f"{f}{n}": lambda x, f=f, n=n: apply(f"{f}v", float(n), x)
        for f in "jyik" for n in (0, 1)},

@@ -658,7 +658,9 @@ class _Place:
                     if key[0] == "kept":
                         self.keep((key, axis), x)
                     elif not is_zero(x):
-                        ahead = self._acting(axis, k, self.code.operand(x, self.scene.type))
+                        ahead = self.code.operand(x, self.scene.type)
+                        if self.scene.form.boundary[axis] == "free":  # 0 where a free end leaves a bond out
+                            ahead = self.scene.within(ahead, self.inside(axis, k))
                         change = self.behind(axis, k, key[1], ahead) - ahead
                         total[key[1]] = total[key[1]] + change if key[1] in total else change
         if self.one.name in (OPEN, MIDDLE):
@@ -687,12 +689,6 @@ class _Place:
             return total.get(key[1], 0.0)
         found = self.scene.values.get(key)
         return found if found is not None else self.get(("array", key[1]) if key[0] == "number" else key)
-
-    def _acting(self, axis: int, k: int, x: Value) -> Value:
-        """The effect of a bond, 0 where a free end leaves it out."""
-        if self.scene.form.boundary[axis] != "free":
-            return x
-        return self.scene.within(x, self.inside(axis, k))
 
     def at_wall(self, key: Key, x: Value) -> Value:
         """Velocities, 0 beyond walls."""
