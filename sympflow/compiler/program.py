@@ -76,7 +76,7 @@ class Recording:
             if found is not None:
                 return found
         if name in _COMMUTE:
-            args = tuple(sorted(args, key=_place))
+            args = tuple(sorted(args, key=lambda x: (1, x.order) if isinstance(x, Traced) else (0, x)))
         return self._number(name, args)
 
     def _as_number(self, x: Any) -> Any:
@@ -94,10 +94,6 @@ def _constant(x: Any) -> float:
     if isinstance(x, float | int | np.generic) and not isinstance(x, complex | np.complexfloating):
         return float(x)
     raise TypeError(f"a number that is traced cannot be combined with {type(x).__name__}: give floats.")
-
-
-def _place(x: Any) -> tuple[int, float]:
-    return (1, x.order) if isinstance(x, Traced) else (0, x)
 
 
 MOST_DERIVED = 5000  # operations through which derivatives of single outputs are taken

@@ -921,7 +921,7 @@ class LatticeCode(SharedRollouts):
         self._stages = _stages(Form.of(lattice, self._order, level, compensated, damped, width, even))
         self._functions, self._lock = self._stages.functions, self._stages.lock
         self.memory = partial(LatticeInMemory, self._stages)
-        self.work, self.terms = lattice.ndof, 1 + level
+        self.work, self.terms, self._slabs = lattice.ndof, 1 + level, dict[int, Slabs]()
 
     @cached_property
     def size(self) -> int:
@@ -929,10 +929,6 @@ class LatticeCode(SharedRollouts):
 
     def stage(self, room: Any, numbers: Numbers, kind: Value, step: Value) -> Any:
         self._stages.stage(room, numbers, kind)
-
-    @cached_property
-    def _slabs(self) -> dict[int, Slabs]:
-        return {}
 
     def members(self, meeting: np.ndarray, stop: np.ndarray, threads: int, block: int) -> Callable[[int], Member]:
         slabs = self._slabs.get(threads)

@@ -23,7 +23,6 @@ from sympflow.lazy import kept
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT, Scheme
 
 if TYPE_CHECKING:
-    from sympflow.hamiltonian.friction import Friction
     from sympflow.kernels.approximations import Ranges
     from sympflow.kernels.reverse import Recorded
     from sympflow.kernels.rollouts import SplittingRollouts
@@ -389,6 +388,4 @@ class SplittingKernel(Kernel):
         return np.concatenate([y, values], axis=1, dtype=np.float64)
 
 
-@lru_cache(maxsize=256)
-def _damped(table: StageTable, friction: Friction) -> StageTable:
-    return table.damped(friction)
+_damped = lru_cache(maxsize=256)(StageTable.damped)
