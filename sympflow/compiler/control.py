@@ -161,12 +161,7 @@ class Module:
         self._uses: dict[str, int] = {}
 
     def function(
-        self,
-        name: str,
-        arguments: Sequence[Type],
-        result: Type | None = None,
-        within: bool = False,
-        rare: bool = True,
+        self, name: str, arguments: Sequence[Type], result: Type | None = None, within: bool = False, rare: bool = True
     ) -> Code:
         """Begin a function; `within` for one that is called by the others only, `rare`ly, and not copied into them."""
         return Code(self, name, arguments, result, within, rare)

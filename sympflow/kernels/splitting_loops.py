@@ -23,7 +23,6 @@ from sympflow.lazy import kept
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT, Scheme
 
 if TYPE_CHECKING:
-    from sympflow.hamiltonian.friction import Friction
     from sympflow.kernels.approximations import Ranges
     from sympflow.kernels.reverse import Recorded
     from sympflow.kernels.rollouts import SplittingRollouts
@@ -61,7 +60,6 @@ class SplittingLoops:
         self._driving: Driving | TracedDriving | None = None
         self._written: Callable[..., Splitting] | None = None
         self._compile: Callable[..., SplittingRollouts]
-        self._longs: dict[int, bool] = {}
         self._damped_numbers: tuple[Any, np.ndarray] = None, np.empty(0)  # of the latest steps that are all alike
         self.tensors: Sequence[Any] = ()
         self.abreast = 1.0
@@ -166,41 +164,38 @@ class SplittingLoops:
     ) -> SplittingRollouts:
         """The compiled functions for kicks of a level, `varied` with own values, in `ranges` by polynomials."""
         variant = (level, compensated, monomials, varied, ranges)
-        if variant not in self._variants:
-            if level in (FORCE_GRADIENT, CURVATURE) and not self._has_force_gradient:
-                raise NotCompiled(
-                    "`scheme` has force gradients, which need a kinetic energy quadratic in p and, for a system of "
-                    "Numba functions, `hessian_vector`: take a scheme without them, for instance 'kahan_li8'."
-                )
-            if level > FORCE_GRADIENT and not self._has_curvature:
-                what = "curvature terms" if level == CURVATURE else "polynomials"
-                raise NotCompiled(f"`scheme` has {what}, which need a symbolic system: take one without them.")
-            self._variants[variant] = self._made(*variant)
-        return self._variants[variant]
-
-    def _made(
-        self, level: int, compensated: bool, monomials: Monomials, varied: bool, ranges: Ranges | None
-    ) -> SplittingRollouts:
+        if variant in self._variants:
+            return self._variants[variant]
+        if level in (FORCE_GRADIENT, CURVATURE) and not self._has_force_gradient:
+            raise NotCompiled(
+                "`scheme` has force gradients, which need a kinetic energy quadratic in p and, for a system of Numba "
+                "functions, `hessian_vector`: take a scheme without them, for instance 'kahan_li8'."
+            )
+        if level > FORCE_GRADIENT and not self._has_curvature:
+            what = "curvature terms" if level == CURVATURE else "polynomials"
+            raise NotCompiled(f"`scheme` has {what}, which need a symbolic system: take one without them.")
+        made: SplittingRollouts
         if not self.traced:
-            return self._compile(level, compensated, monomials)
-        if not varied and self._long(level):
+            made = self._compile(level, compensated, monomials)
+        elif not varied and self._long(level):
             from sympflow.kernels.array_splittings import term_code
 
-            return term_code(self.splitting(level, monomials, compensated, parametric=False))
-        from sympflow.kernels.splittings import SplittingCode, shared
+            made = term_code(self.splitting(level, monomials, compensated, parametric=False))
+        else:
+            from sympflow.kernels.splittings import SplittingCode, shared
 
-        splitting = self.splitting(level, monomials, compensated, ranges or ())
-        return shared(splitting.key, lambda: SplittingCode(splitting))
+            splitting = self.splitting(level, monomials, compensated, ranges or ())
+            made = shared(splitting.key, lambda: SplittingCode(splitting))
+        self._variants[variant] = made
+        return made
 
     def _long(self, level: int) -> bool:
         """True of stages that are loops over the terms of H."""
         if not self._large or not self.traced:
             return False
-        if level not in self._longs:
-            from sympflow.kernels.terms import is_long
+        from sympflow.kernels.terms import is_long
 
-            self._longs[level] = is_long(self._form, level)
-        return self._longs[level]
+        return is_long(self._form, level)
 
     def splitting(
         self,
@@ -241,12 +236,7 @@ class SplittingLoops:
         return position_ranges(system.symbols, system.domain)
 
     def rows(
-        self,
-        table: StageTable,
-        h: float = 1.0,
-        t0: float = 0.0,
-        varied: bool = False,
-        ranges: Ranges | None = None,
+        self, table: StageTable, h: float = 1.0, t0: float = 0.0, varied: bool = False, ranges: Ranges | None = None
     ) -> np.ndarray:
         """The numbers of a table that the loops read, with values, maps of friction, the times of a driven system."""
         if self.friction:
@@ -398,6 +388,4 @@ class SplittingKernel(Kernel):
         return np.concatenate([y, values], axis=1, dtype=np.float64)
 
 
-@lru_cache(maxsize=256)
-def _damped(table: StageTable, friction: Friction) -> StageTable:
-    return table.damped(friction)
+_damped = lru_cache(maxsize=256)(StageTable.damped)

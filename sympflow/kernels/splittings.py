@@ -575,18 +575,13 @@ class SplittingCode(SplittingRollouts):
         if self.timed:
             return np.stack([np.broadcast_to(row, (len(kinds), *shape)) for row in table], axis=1)
         entries = np.zeros((len(kinds), self.size, *shape))
-        for k, columns in self._columns_of_kinds(kinds):
+        for k in range(len(self._kinds)):
+            columns = slice(None) if len(self._kinds) == 1 else kinds == k
             with np.errstate(all="ignore"):
                 rows = self._kinds[k].table(*(row[columns] for row in table))
             for i, row in enumerate(rows):
                 entries[columns, i] = row
         return entries
-
-    def _columns_of_kinds(self, kinds: np.ndarray) -> list[tuple[int, Any]]:
-        """The kinds with their columns."""
-        if len(self._kinds) == 1:
-            return [(0, slice(None))]
-        return [(k, kinds == k) for k in range(len(self._kinds))]
 
     def own_entries(self, table: Any, values: np.ndarray) -> Columns:
         """The numbers of the columns of trajectories with their own values of the parameters."""

@@ -110,14 +110,10 @@ def _vector_moved(
     """A vector (q, p) after a stage, of the derivatives that its program gives after the state."""
     n = d * (d + 1) // 2
     bend, slant, end = derivatives[:n], derivatives[n : n + d * d], derivatives[n + d * d :]
-    p = [summed(p[i], [bend[_place(i, j)] for j in range(d)], q) for i in range(d)]
+    rows = [[bend[max(i, j) * (max(i, j) + 1) // 2 + min(i, j)] for j in range(d)] for i in range(d)]  # symmetric
+    p = [summed(x, row, q) for x, row in zip(p, rows, strict=True)]
     q = [summed(q[i], slant[d * i : d * (i + 1)], p) for i in range(d)]
     return q, [summed(0.0, end[d * i : d * (i + 1)], p) for i in range(d)] if end else p
-
-
-def _place(i: int, j: int) -> int:
-    """The place of an entry of a symmetric matrix, whose rows end at the diagonal."""
-    return max(i, j) * (max(i, j) + 1) // 2 + min(i, j)
 
 
 class TangentCode(SplittingCode):
