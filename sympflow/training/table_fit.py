@@ -105,9 +105,9 @@ class TableRun(SearchRun):
             if (deadline.session.passed - began) / len(t) * fractions > HELD_OUT_SHARE * deadline.left:
                 fractions = min(fractions, len(t))
             slope = energy_slope(system, labels, options.energy_weight)
-            self._fit_frozen(labels.at(-1), slope)
+            self._fit_frozen(labels.part(last=True), slope)
             weight = np.where(t < t[-1], 1.0, options.frozen_weight)
-            labels = labels.first(fewer := max(FITTED_POINTS, enough // 2))
+            labels = labels.part(fewer := max(FITTED_POINTS, enough // 2))
             slope = None if slope is None else slope[:, :fewer]
             parts.append((options.label_weight, TableFit(step, labels, *table.polynomial(t), unit, weight, slope)))
         elif options.label_weight and data is not None:
