@@ -36,6 +36,7 @@ from sympflow.training.points import (
     states,
     step_errors,
     stream_seed,
+    unlabelled,
 )
 from sympflow.training.runs import LABEL_SHARE, SearchRun, descended
 from sympflow.training.session import Deadline, Session
@@ -84,6 +85,8 @@ class TableRun(SearchRun):
         self.given = table.parameters()
         fractions = FRACTIONAL_TIMES
         data: Any = options.data
+        if data is not None and options.losses == "labels":
+            self.unfitted = unlabelled(data[0], flow.dt)
         self.step = step = TableStep(system, flow.sequence, flow.tables.level, flow.monomials, compiled=True)
         unit = np.array(scaling.x)
         if options.residual_weight or options.matching_weight or data is not None:
