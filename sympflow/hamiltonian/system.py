@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sympflow.arguments import check_flag, check_positive, checked_count, floats, real_number, warn
-from sympflow.arrays import Array, one_lane
+from sympflow.arrays import Array, differentiable, is_tensor, one_lane, to_numpy
 from sympflow.hamiltonian.definition import bare_copy
 from sympflow.hamiltonian.domain import Domain, domain_of
 from sympflow.hamiltonian.fingerprint import fingerprint
@@ -172,7 +172,8 @@ class HamiltonianSystem(Hamiltonian, Answering):
     ndof : int
         Degrees of freedom d.
     mass : float or array_like of shape (d,) or (d, d), optional
-        M, symmetric positive definite; the default is 1. Only with `potential`.
+        M, symmetric positive definite; the default is 1. Only with `potential`. To a tensor that requires gradients
+        these flow, by tensor operations: runs are not compiled then.
     gradient : callable, optional
         ∇V(q), (..., d) to (..., d); as a Numba function: gradient(q, out).
     hessian_vector : callable, optional
@@ -280,12 +281,15 @@ class HamiltonianSystem(Hamiltonian, Answering):
         for argument, value in (("mass", mass), ("stiffness_matrix", stiffness_matrix)):
             if value is not None and not definition.separable:
                 raise TypeError(f"`{argument}` only goes with `potential`: leave it out, it is part of `hamiltonian`.")
-        inverse_mass, quadratic = checked_inverse_mass(mass, d) if definition.separable else None, definition.separable
+        followed = mass if is_tensor(mass) and (mass.requires_grad or differentiable(mass)) else None
+        M: Any = mass if followed is None else to_numpy(followed)
+        inverse_mass, quadratic = checked_inverse_mass(M, d) if definition.separable else None, definition.separable
         K = None if stiffness_matrix is None else checked_stiffness(stiffness_matrix, d)
         if hamiltonian is not None:
             domain = settled.domain if isinstance(settled.domain, Domain) else None
             definition.place(settled.state(d), domain, None, settled.t_span)
             definition, inverse_mass, quadratic = definition.as_sum() or (bare_copy(definition), None, False)
+        self.followed_mass = followed
         self._make(definition, inverse_mass, quadratic, {}, settled, damping, period, K)
 
     @classmethod

@@ -50,7 +50,7 @@ class Path:
         self.driven = system is not None and not system.autonomous
         self.start = t0.to(torch.float64)
         self.t0: Any = 0.0 if not self.driven else self.start if differentiable(t0) else float(t0)
-        learns = system is not None and system.definition.learns(y0)  # True if torch follows numbers of H
+        learns = system is not None and system.learns(y0)  # True if torch follows numbers of H
         self.eager = learns or differentiable(*self.weights(), self.t0)
 
     def __call__(self, s: Tensor) -> Tensor:
@@ -375,7 +375,7 @@ class _PulledBack(torch.autograd.Function):
 def leaves(system: HamiltonianSystem, y: Tensor, t: float) -> list[Tensor]:
     """The leaves of the graph on which the vector field at y and t depends, other than y: a network's weights."""
     y = y.detach()
-    if not system.definition.learns(y):
+    if not system.learns(y):
         return []
     found: list[Tensor] = []
     waiting, seen = [system.vector_field(y, t).grad_fn], set()

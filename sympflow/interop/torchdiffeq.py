@@ -282,9 +282,7 @@ def odeint_adjoint(
         own = [] if adjoint_params is not None or system is None else leaves(system, y, start)
         parameters = (*(given or ()), *own)
         flow = integrator.flow_for(system)  # type: ignore[arg-type]
-        field = (
-            [system.vector_field(unfollowed(y), start)] if system is not None and system.definition.learns(y) else []
-        )
+        field = [system.vector_field(unfollowed(y), start)] if system is not None and system.learns(y) else []
         if transformed(y, t, *field, *parameters, *(() if flow is None else flow.parameters())):
             raise TypeError(
                 "`odeint_adjoint` is for reverse mode, backward() and torch.autograd.grad: in forward mode, and inside "
