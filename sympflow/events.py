@@ -17,7 +17,6 @@ from sympflow.arrays import Array, copied, detached, differentiable, stack, to_n
 
 EventFunction = Callable[[float, Array], Any]
 Dense = Callable[[float], Array]  # the state at a time within one step
-
 _EPS = float(np.finfo(float).eps)
 
 

@@ -53,7 +53,6 @@ __all__ = [
 
 GROUP = "sympflow.schemes"
 """The entry-point group in which a distribution announces its schemes: `name = "package.module:SCHEME"`."""
-
 FORCE_GRADIENT, CURVATURE, POLYNOMIAL = 1, 2, 3  # levels of a scheme, or of a flow: what its kicks have beside V
 
 
@@ -343,12 +342,10 @@ _OMELYAN = (
     "I. P. Omelyan, I. M. Mryglod and R. Folk, Construction of high-order force-gradient algorithms for "
     "integration of motion in classical and quantum systems, Phys. Rev. E 66 (2002) 026701"
 )
-
 _NEARLY_INTEGRABLE = (
     "S. Blanes, F. Casas, A. Farrés, J. Laskar, J. Makazaga and A. Murua, New families of symplectic splitting methods "
     "for numerical integration in dynamical astronomy, Appl. Numer. Math. 68 (2013) 58–72"
 )
-
 _YOSHIDA4_WEIGHT = 1.0 / (2.0 - 2.0 ** (1.0 / 3.0))
 _SUZUKI4_WEIGHT = 1.0 / (4.0 - 4.0 ** (1.0 / 3.0))
 _ROOT19 = sqrt(19.0)
@@ -432,7 +429,6 @@ _TABLE = (
 # fmt: on
 
 SCHEMES: dict[str, Scheme] = {scheme.name: scheme for scheme in _TABLE}
-
 _registered: dict[str, Scheme] = {}
 
 

@@ -83,7 +83,6 @@ class Solution(Answering):
         **dict.fromkeys(("method", "solver"), "`integrator`"),
         **dict.fromkeys(("save", "to_csv"), "`to_dataframe()`, `to_xarray()` or `to_netcdf(path)`"),
     }
-
     t: np.ndarray
     y: Array
     status: int | np.ndarray
@@ -354,7 +353,6 @@ class StoredSolution(Solution):
     """A solution whose outputs are in a store, from which `t` and `y` are read whenever they are asked for."""
 
     store: RunStore | None = None
-
     t = _stored("_t", lambda store: store.times())
     y = _stored("_y", lambda store: store.states())
 

@@ -363,7 +363,7 @@ def _solved(integrator: Integrator, problem: Problem, action: str, rows: Paramet
     integrator.check_library(y_start)
     run: Callable[[Integrator, Problem], tuple[Outcome, Problem]] = _run
     able = problem.store is None and problem.parameter_values is None
-    told, jumps = landings(integrator, between, problem.t0, problem.t1, able)
+    told, jumps = landings(integrator, between, problem.t0, problem.t1, able, kinks=True)
     if told:
         without = "a `store`" if problem.store is not None else "gradients by `params`, and with `t_eval`"
         warn(told if able else f"{told} Without {without}, steps end at jumps.", RuntimeWarning)
@@ -473,24 +473,16 @@ def _solved_rows(integrator: Integrator, problem: Problem, action: str, rows: Pa
     except Interrupted as stop:
         pieces.append((index, stop.solution))
         whole = max((sol for _, sol in pieces), key=lambda sol: len(sol.t))
-        pieces += [(index, _not_begun(stop.solution, part)) for index, part in groups[len(pieces) :]]
-        pieces = [(index, _up_to(sol, whole.t)) for index, sol in pieces]
+        for index, part in groups[len(pieces) :]:  # not begun
+            y, status = part.y0[..., None][..., :0], np.full(tuple(part.y0.shape[:-1]), -1)
+            own = replace(stop.solution, t=whole.t[:0], y=y, status=status, system=part.system, y0=part.y0)
+            pieces.append((index, own))
+        for i, (index, sol) in enumerate(pieces):  # unknown, NaN, at the last outputs
+            unknown = [full_of_nan(sol.y0)[..., None]] * (len(whole.t) - len(sol.t))
+            pieces[i] = index, replace(sol, t=whole.t, y=concatenate([sol.y, *unknown]), sol=None)
         sol = joined(pieces, problem.system, problem.y0, rows)
         raise Interrupted(stop.outcome, replace(sol, message=stop.solution.message)) from None
     return joined(pieces, problem.system, problem.y0, rows)
-
-
-def _not_begun(sol: Solution, problem: Problem) -> Solution:
-    """The solution of trajectories that were to run after those of `sol`, which Ctrl-C ended."""
-    batch, y0 = tuple(problem.y0.shape[:-1]), problem.y0
-    empty = y0[..., None][..., :0]
-    return replace(sol, t=sol.t[:0], y=empty, status=np.full(batch, -1), system=problem.system, y0=y0, sol=None)
-
-
-def _up_to(sol: Solution, t: np.ndarray) -> Solution:
-    """A solution of which the outputs at the last ones of the times t are unknown, NaN."""
-    unknown = full_of_nan(sol.y0)[..., None]
-    return replace(sol, t=t, y=concatenate([sol.y, *[unknown] * (len(t) - len(sol.t))]), sol=None)
 
 
 def _run(integrator: Integrator, problem: Problem) -> tuple[Outcome, Problem]:

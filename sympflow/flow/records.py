@@ -98,7 +98,11 @@ class Provenance:
         for name, value in record["figures"].items():
             if value is not None and not _is_number(value):
                 raise Refused(f"its figures have a {name} that is neither a number nor None: {value!r}")
-        certificate, identity = _certificate(record), _identity(record, ndof)
+        identity, certificate = _identity(record, ndof), None
+        if record.get("certificate") is not None:
+            certificate = _made("certificate", Certificate.from_dict, record["certificate"])
+            if certificate.weights != record.get("checksum"):
+                raise Refused("its certificate is one of other weights")
         domain = None if record["domain"] is None else _domain(record["domain"], ndof)
         if fingerprint is not None:
             fingerprint = tuple(math.nan if v is None else float(v) for v in fingerprint)
@@ -106,6 +110,9 @@ class Provenance:
         driven = _intervals(record.get("drive_times", []), "times of its drive")
         if len(driven) > 1 or any(low >= high for low, high in driven):
             raise Refused("its times of the drive are not one interval")
+        texts = record.get("lattice_terms", {})  # which are shown and never read
+        if not isinstance(texts, dict) or not all(isinstance(text, str) for text in texts.values()):
+            raise Refused("its terms of a lattice are not a table of texts")
         return cls(
             domain,
             system,
@@ -116,7 +123,7 @@ class Provenance:
             identity,
             unfitted,
             driven[0] if driven else None,
-            _texts(record.get("lattice_terms", {})),
+            texts,
         )
 
 
@@ -239,16 +246,6 @@ def _made(what: str, make: Callable[..., T], *given: Any) -> T:
         raise Refused(f"its {what} is not admissible ({error})") from None
 
 
-def _certificate(record: dict[str, Any]) -> Certificate | None:
-    """Return the certificate in the record, if there is one; it must be of the weights that the file holds."""
-    if record.get("certificate") is None:
-        return None
-    certificate = _made("certificate", Certificate.from_dict, record["certificate"])
-    if certificate.weights != record.get("checksum"):
-        raise Refused("its certificate is one of other weights")
-    return certificate
-
-
 def _identity(record: dict[str, Any], ndof: int) -> Identity | None:
     """Return the identity of the system in the record, if there is one; a text in it is not read yet."""
     kept = record.get("identity")
@@ -262,13 +259,6 @@ def _intervals(pairs: Any, what: str) -> tuple[tuple[float, float], ...]:
     if not all(_is_number(v) for pair in pairs for v in pair):
         raise Refused(f"its {what} are not numbers")
     return tuple((float(low), float(high)) for low, high in pairs)
-
-
-def _texts(table: Any) -> dict[str, str]:
-    """Return a table of texts in a record, which are shown and never read; else it is refused."""
-    if not isinstance(table, dict) or not all(isinstance(text, str) for text in table.values()):
-        raise Refused("its terms of a lattice are not a table of texts")
-    return table
 
 
 def _check_system(name: Any, fingerprint: Any, ndof: int) -> None:

@@ -34,7 +34,7 @@ from sympflow.arrays import (
 from sympflow.compiler.program import Program, derivatives, gradient, reached, traced
 from sympflow.compiler.tracing import WEIGHTS, Untraceable, trace, trace_chain
 from sympflow.hamiltonian.definition import Definition
-from sympflow.hamiltonian.formulas import TracedHamiltonian, TracedPoles
+from sympflow.hamiltonian.formulas import TracedHamiltonian, TracedPoles, without_overflow
 from sympflow.hamiltonian.function_checks import Tested, check_writes, probe_states, test
 from sympflow.hamiltonian.layered import LayeredPotential
 from sympflow.hamiltonian.linear_part import simplest
@@ -78,8 +78,10 @@ class CallableHamiltonian(Definition):
         self._functions = functions
         if _is_numba(gradient):
             _check_numba(potential, gradient, hessian_vector, "t, " * timed)
-            self.numba_functions = potential, gradient, hessian_vector
-        of_arrays = [None if f is None else _OverTimes(f) if timed else f for f in self._of_states]
+            self.numba_functions = given = potential, gradient, hessian_vector
+            V, slope, product = (NumbaFunction(given, order) for order in range(3))
+            functions = V, None, slope, None if hessian_vector is None else product
+        of_arrays = [None if f is None else _OverTimes(f) if timed else f for f in functions]
         self._potential, self._hamiltonian, self._gradient, self._hessian_vector = of_arrays
 
     def as_sum(self) -> tuple[CallableHamiltonian, np.ndarray | None, bool] | None:
@@ -108,14 +110,6 @@ class CallableHamiltonian(Definition):
         made._kinetic, made.kinetic = T.program, T.value
         made.kinetic_gradient, made.kinetic_hessian = T.gradient, T.hessian
         return made, None, False
-
-    @property
-    def _of_states(self) -> Sequence[Any]:
-        """V, H, the gradient and the product as functions of arrays of states, the time first."""
-        if self.numba_functions is None:
-            return self._functions
-        V, gradient, product = (NumbaFunction(self.numba_functions, order) for order in range(3))
-        return V, None, gradient, None if self.numba_functions[2] is None else product
 
     def identity_parts(self) -> Any:
         return [self.ndof, self._functions] if self.timed else [self.ndof, *self._functions]
@@ -177,8 +171,8 @@ class CallableHamiltonian(Definition):
     def may_jump(self) -> bool:  # type: ignore[override]
         return self._jumping.may_jump
 
-    def jump_times(self, low: float, high: float, step: float) -> np.ndarray:
-        return self._jumping.jump_times(low, high, step)
+    def jump_times(self, low: float, high: float, step: float, kinks: bool = False) -> np.ndarray:
+        return self._jumping.jump_times(low, high, step, kinks)
 
     @property
     def has_hessian_vector(self) -> bool:  # type: ignore[override]
@@ -212,7 +206,7 @@ class CallableHamiltonian(Definition):
         values, f = self._values(states, times), self._given_function
         d = self.ndof
         names: list[Any] = [[f"{letter}{i + 1}" for i in range(d)] for letter in "qp"[: 2 - self.separable]]
-        program = trace(f, ["t", *names] if self.timed else names, self.library == "torch")
+        program = without_overflow(trace(f, ["t", *names] if self.timed else names, self.library == "torch"))
         form = TracedHamiltonian(d, program, self.separable, inverse_mass, self.timed, self._kinetic)
         at = (np.array(times),) if self.timed else ()
         x = states[:, :d] if self.separable else states

@@ -55,14 +55,13 @@ class Definition:
     untraced: str = ""  # the reason for which they could not, a clause, known after `form`
     given_functions: bool = False  # of Python, which are traced where that is possible
     instead: str = "an implicit method such as 'gauss_legendre6', or a Runge–Kutta method"
-
     _generated: tuple[str, ...] = ("_functions",)  # what cannot be pickled, and is made again
 
     def __getstate__(self) -> dict[str, Any]:
         return {name: value for name, value in vars(self).items() if name not in self._generated}
 
-    def jump_times(self, low: float, high: float, step: float) -> np.ndarray:
-        """The times (n,) between two others at which H is known to jump; `step` as of `Hamiltonian.jump_times`."""
+    def jump_times(self, low: float, high: float, step: float, kinks: bool = False) -> np.ndarray:
+        """The times (n,) between two others at which H is known to jump; the rest as of `Hamiltonian.jump_times`."""
         return np.zeros(0)
 
     @property

@@ -8,12 +8,6 @@ the mean of the copies and their difference, q₊, p₊ and q₋, p₋, it is
 with positions (q₊, q₋) and momenta (p₋, p₊), in this order: the partner of q₊ is p₋. These are H(1) − H(2) − K of the
 copies with K = q₋·F, to first order in the difference, which is all that the physical limit q₋ = p₋ = 0 keeps. There
 (q₊, p₊) moves as above, and the difference stays 0.
-
-References
-----------
-.. [1] C. R. Galley, "Classical mechanics of nonconservative systems", Phys. Rev. Lett. 110 (2013) 174301, eqs. (5)–(9).
-.. [2] D. Tsang, C. R. Galley, L. C. Stein, A. Turner, "'Slimplectic' integrators: variational integrators for general
-   nonconservative systems", Astrophys. J. Lett. 809 (2015) L9.
 """
 
 from __future__ import annotations
@@ -30,7 +24,6 @@ from sympflow.hamiltonian.domain import Box, Domain
 from sympflow.hamiltonian.system import HamiltonianSystem
 
 Force = Callable[[Array, Array], Array]
-
 THIN = 0.1  # width of the default domain in q₋ and p₋, over that in q and p
 _DRAWN = 1000  # states that find the extent of a domain
 
@@ -160,7 +153,7 @@ def doubled(
         F: Any = GivenForce(force if given else lambda q, p: 0 * p)
         made = DoubledSystem(hamiltonian=_DoubledFunctions(system, F), ndof=2 * system.ndof, check=False, **scene)
     else:
-        from sympflow.hamiltonian.forces import SymbolicForce, doubled_hamiltonian
+        from sympflow.hamiltonian.symbolic import SymbolicForce, doubled_hamiltonian
 
         F = SymbolicForce(system, [0] * system.ndof if force is None else force, params)
         if system.conservative and F.has_potential:

@@ -27,7 +27,6 @@ SHORT = 0.25  # βX² up to which a series of so many terms is exact to rounding
 TERMS = 7
 CLOSE = 1e-8  # of X: a step of Newton's or Laguerre's method after which the next one is below rounding
 MOST = 200  # steps of the solver, of which bisection takes a part where nothing else helps
-
 Numbers = list[Any]
 
 

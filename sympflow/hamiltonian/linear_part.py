@@ -70,7 +70,6 @@ class LinearPart(NormalModes):
     center: np.ndarray  # c (d,): where the forces along stiff directions vanish, of a system given by functions
     potential: Any = None  # U(q), what V has beside the quadratic part, if the system is symbolic
     interval: float = 0.0  # length of the system's default interval
-
     dense: ClassVar[bool] = True
     """False of modes by fast transforms, which have no loops."""
 
@@ -215,8 +214,8 @@ def linear_part(system: Any) -> LinearPart:
     check_parts_conservative(system)
     if system.followed_mass is not None:
         raise ValueError(
-            "`mass` requires gradients, which do not flow through the exact linear part: take a method on the splitting "
-            "'kinetic', such as 'srkn11b', or pass mass.detach()."
+            "`mass` requires gradients, which do not flow through the exact linear part: take a method on the "
+            "splitting 'kinetic', such as 'srkn11b', or pass mass.detach()."
         )
     part: LinearPart | None
     if system.stiffness_matrix is not None:

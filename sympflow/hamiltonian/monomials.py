@@ -17,7 +17,6 @@ if TYPE_CHECKING:
 
 MOST_MONOMIALS = 60
 MOST_MIRRORED = 6  # coordinates of which all combinations of signs are tried
-
 Monomials = tuple[tuple[int, ...], ...]  # exponents of q1 … qd, one tuple a monomial
 
 

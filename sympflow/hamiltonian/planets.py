@@ -31,13 +31,11 @@ COORDINATES = ("jacobi", "democratic")
 ELEMENTS = ("a", "e", "inc", "node", "peri", "M")
 """Names of orbital elements: semi-major axis, eccentricity, inclination, longitude of the ascending node, argument of
 the pericentre, mean anomaly; angles in radians."""
-
 SUN = 1.3271244e20
 LENGTHS = {"m": 1.0, "km": 1e3, "AU": 149_597_870_700.0}
 TIMES = {"s": 1.0, "day": 86_400.0, "year": 365.25 * 86_400.0}
 MASSES = {"kg": 6.67430e-11, "solar mass": SUN, "Jupiter mass": 1.2668653e17, "Earth mass": 3.986004e14}
 """Units in SI, masses times G: IAU 2012 B2, IAU 2015 B3, CODATA 2018."""
-
 PLACE = "x", "y", "z", "r"  # names in an extra potential: the place of a body as seen from the star, and its distance
 FEWEST_STEPS = 20  # of a method in the shortest period
 MOON = 0.5  # of a Hill radius: bodies that are nearer may be bound

@@ -43,10 +43,11 @@ from sympflow.hamiltonian.jumps import (
     borders,
     check_continuous,
     has_period,
+    refuse_deltas,
     split_impulses,
 )
 from sympflow.hamiltonian.poles import Poles, SymbolicPoles
-from sympflow.hamiltonian.removable import Max, sinc
+from sympflow.hamiltonian.removable import BOUNDED, Max, sinc
 
 LARGEST, TINY = sys.float_info.max, 1e-150
 MOST_LEFT_OUT = 100  # degrees of freedom up to the last one that a formula may do without
@@ -75,8 +76,8 @@ class Kick:
 def _evaluation(name: str, order: int) -> Callable[..., Array]:
     """Return a method: an expression, its gradient or its Hessian at arrays (..., n), and at times."""
 
-    def evaluate(self: SymbolicHamiltonian, x: Array, *t: Array) -> Array:
-        return self._derivative(name, order)(x, *t)
+    def evaluate(self: SymbolicHamiltonian, x: Array, *t: Array, **numbers: Any) -> Array:
+        return self._derivative(name, order)(x, *t, **numbers)
 
     return evaluate
 
@@ -95,7 +96,6 @@ class SymbolicHamiltonian(Definition):
     meanings: tuple[sp.Expr, ...] = ()
     _written: tuple[sp.Expr, dict[sp.Symbol, sp.Expr]] | None = None
     """H as it was written, and the values of its parameters; None without any."""
-
     time: Any = None
     named_time: sp.Symbol | None = None
     """The time as it was given; `time` is None where H, by the values of its parameters, does not depend on it."""
@@ -262,12 +262,12 @@ class SymbolicHamiltonian(Definition):
         """Borders at which H may jump in t alone."""
         if self.time is None:
             return []
-        own = [border for border in borders(self.H, [self.time]) if border.g.free_symbols == {self.time}]
+        own = [border for border in borders(self.H, [self.time], kinks=True) if border.g.free_symbols == {self.time}]
         return [Switch(border, self.time, self.samples) for border in own]
 
-    def jump_times(self, low: float, high: float, step: float) -> np.ndarray:
+    def jump_times(self, low: float, high: float, step: float, kinks: bool = False) -> np.ndarray:
         found = [samples.jump_times(low, high) for samples in self.samples.values()]
-        found += [each.times(low, high, step) for each in self._switches]
+        found += [each.times(low, high, step, kinks) for each in self._switches]
         times = np.unique(np.concatenate(found)) if found else np.zeros(0)
         return times[np.diff(times, prepend=-np.inf) > 8 * sys.float_info.epsilon * np.abs(times)]
 
@@ -358,11 +358,11 @@ class SymbolicHamiltonian(Definition):
     kinetic_gradient = _evaluation("T", 1)
     kinetic_hessian = _evaluation("T", 2)
 
-    def gradient(self, y: Array, *t: Array) -> Array:
+    def gradient(self, y: Array, *t: Array, **numbers: Any) -> Array:
         if self.separable:
             q, p = y[..., : self.ndof], y[..., self.ndof :]
-            return concatenate([self.potential_gradient(q, *t), self.kinetic_gradient(p, *t)])
-        return self._derivative("H", 1)(y, *t)
+            return concatenate([self.potential_gradient(q, *t, **numbers), self.kinetic_gradient(p, *t, **numbers)])
+        return self._derivative("H", 1)(y, *t, **numbers)
 
     def evaluated(self, name: str, expressions: list[sp.Expr]) -> Callable[..., Array]:
         """A function of y (..., 2d), and of t, that gives the values (..., n) of expressions, kept under a name."""
@@ -838,7 +838,7 @@ def _modules(library: str, code: list[sp.Expr]) -> list[Any]:
     if library == "torch":
         known |= {"erf", "tensor_erfc"}
     names = {type(f).__name__ for expression in code for f in expression.atoms(sp.Function)} - {"integer_power"}
-    special = sorted(names - known - {"Max", "Min", "Abs", "Heaviside", "sign", "Piecewise"})
+    special = sorted(names - known - {"Max", "Min", "Abs", "Heaviside", "sign", "Piecewise", *BOUNDED})
     if library == "numpy":
         own = {"integer_power": _integer_power, "Heaviside": np.heaviside}
         return [own | _special_functions(), "scipy", "numpy"] if special else [own, "numpy"]
@@ -868,3 +868,82 @@ def _modules(library: str, code: list[sp.Expr]) -> list[Any]:
         },
         "torch",
     ]
+
+
+class SymbolicForce:
+    """F(q, p) by expressions, one for each momentum."""
+
+    def __init__(self, system: Any, force: Any, params: Mapping[str, float] | None) -> None:
+        symbols = system.symbols
+        self.q, self.p, self.time = symbols.q, symbols.p, symbols.time
+        self.form = symbols.like(symbols.H)  # with functions of its own
+        d = system.ndof
+        several = isinstance(force, Sequence | np.ndarray | sp.MatrixBase) and not isinstance(force, str)
+        written = list(force) if several else [force]
+        if len(written) != d:
+            raise ValueError(
+                f"`force` must have {d} components, one for each momentum of {system.name!r}; got {len(written)}."
+            )
+        values = {**system.params, **checked_params(params)}
+        read_ones = [stated("force", each, values) for each in written]
+        if any(complex_part(f) is not None for f in read_ones):
+            raise TypeError("`force` must be real expressions, texts or SymPy's, or a function F(q, p).")
+        for name in params or {}:
+            if not any(sp.Symbol(name, real=True) in f.free_symbols for f in read_ones):
+                raise ValueError(f"`params` has {name!r}, which the force does not use: remove it.")
+        self.expressions = [self._valued(f, values) for f in read_ones]
+        for f in self.expressions:
+            refuse_deltas("force", f)
+
+    def _valued(self, f: sp.Expr, values: Mapping[str, float]) -> sp.Expr:
+        """The expression in the system's coordinates, its parameters replaced by their values."""
+        d = len(self.q)
+        known: dict[sp.Symbol, sp.Expr] = {sp.Symbol(name, real=True): exact(value) for name, value in values.items()}
+        if d == 1:
+            known |= {sp.Symbol("q", real=True): self.q[0], sp.Symbol("p", real=True): self.p[0]}
+        f = f.xreplace(known)
+        unknown = sorted(s.name for s in f.free_symbols - {*self.q, *self.p, self.time})
+        beyond = [name for name in unknown if COORDINATE.fullmatch(name)]
+        if beyond:
+            raise ValueError(
+                f"`force` holds {', '.join(beyond)}, but the system has the coordinates {self.q[0]} … {self.p[-1]}: "
+                "write it in these."
+            )
+        if "t" in unknown:
+            raise ValueError(
+                "`force` depends on the time t, but the system does not: leave t out, or name the time of the system."
+            )
+        if unknown:
+            raise ValueError(f"`force` holds {', '.join(unknown)} without a value: give it in `params`.")
+        return f
+
+    def __call__(self, q: Array, p: Array, *t: Any) -> Array:
+        return self.form.evaluated("force", self.expressions)(concatenate([q, p]), *t)
+
+    def jacobian(self, q: Array, p: Array, *t: Any) -> Array:
+        x = (*self.q, *self.p)
+        slopes = [sp.diff(f, s) for f in self.expressions for s in x]
+        return self.form.evaluated("force 1", slopes)(concatenate([q, p]), *t).reshape(*p.shape, len(x))
+
+    @property
+    def has_potential(self) -> bool:
+        """True if F is −∇U(q)."""
+        F, q = self.expressions, self.q
+        if any(f.free_symbols & {*self.p} for f in F):
+            return False
+        return all(sp.expand(sp.diff(F[i], q[j]) - sp.diff(F[j], q[i])) == 0 for i in range(len(q)) for j in range(i))
+
+
+def doubled_hamiltonian(system: Any, force: SymbolicForce) -> sp.Expr:
+    """p₋·∂H/∂p + q₋·(∂H/∂q + Γp − F) in q1 … q2d, p1 … p2d, which are q₊, q₋ and p₋, p₊."""
+    symbols = system.symbols
+    d = system.ndof
+    q, p = (sp.symbols(f"{letter}1:{2 * d + 1}", real=True) for letter in "qp")
+    G = system.friction.matrix(d)
+    mean = dict(zip((*symbols.q, *symbols.p), (*q[:d], *p[d:]), strict=True))
+    terms = []
+    for i, F in enumerate(force.expressions):
+        drag = sp.Add(*[exact(g) * s for g, s in zip(G[i], symbols.p, strict=True) if g])
+        terms.append(p[i] * sp.diff(symbols.H, symbols.p[i]).xreplace(mean))
+        terms.append(q[d + i] * (sp.diff(symbols.H, symbols.q[i]) + drag - F).xreplace(mean))
+    return printable(sp.Add(*terms))

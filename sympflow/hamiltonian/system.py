@@ -49,8 +49,6 @@ SHOWN_NAMES = (
 """The attributes that `dir` lists: those that users need. All others are for methods and studies."""
 MOST_WRITTEN_OUT = 400
 """Coordinates of an expression before a warning: 512 of a chain take 2 s to define, and a step 14 times as long."""
-
-
 UNNAMED = "custom"
 MEANT = {
     **dict.fromkeys(("dim", "dimension", "dimensions"), "degrees of freedom of a function are `ndof`, of pairs `dim`"),
@@ -242,7 +240,6 @@ class HamiltonianSystem(Hamiltonian, Answering):
         **dict.fromkeys(("grad", "jac"), "`gradient(y)`, or `hessian(y)`"),
         "parameters": "`params`",
     }
-
     _period: float | None = None
     _former_period: float | None = None
     _continuous = True  # False of systems that are made of others, whose H may jump where solutions do not feel it
@@ -281,8 +278,9 @@ class HamiltonianSystem(Hamiltonian, Answering):
         for argument, value in (("mass", mass), ("stiffness_matrix", stiffness_matrix)):
             if value is not None and not definition.separable:
                 raise TypeError(f"`{argument}` only goes with `potential`: leave it out, it is part of `hamiltonian`.")
-        followed = mass if is_tensor(mass) and (mass.requires_grad or differentiable(mass)) else None
-        M: Any = mass if followed is None else to_numpy(followed)
+        M: Any = mass
+        followed = M if is_tensor(M) and (M.requires_grad or differentiable(M)) else None
+        M = M if followed is None else to_numpy(M)
         inverse_mass, quadratic = checked_inverse_mass(M, d) if definition.separable else None, definition.separable
         K = None if stiffness_matrix is None else checked_stiffness(stiffness_matrix, d)
         if hamiltonian is not None:

@@ -85,8 +85,14 @@ def time_transformed(
             "method such as 'gauss_legendre4'."
         )
     c = default_shift(system) if shift is None else checked_shift(shift)
-    if _symbols(system) is not None:
-        transformed = HamiltonianSystem.from_sympy(_expression(system, c), name=f"log_{system.name}", energy_scale=1.0)
+    symbols = system.written if system.local is None else system.local.spelled  # with all terms one by one
+    if symbols is not None:
+        import sympy as sp
+
+        from sympflow.hamiltonian.symbolic import exact
+
+        H = sp.log(symbols.T + sp.Symbol(f"p{symbols.ndof + 1}", real=True)) - sp.log(exact(c) - symbols.V)
+        transformed = HamiltonianSystem.from_sympy(H, name=f"log_{system.name}", energy_scale=1.0)
         transformed._params = Parameters({**system.params, "shift": c})
     else:
         transformed = HamiltonianSystem.__new__(HamiltonianSystem)
@@ -148,21 +154,6 @@ def projected(x: Array) -> Array:
     """[q, p] of states [q, t, p, B]."""
     d = x.shape[-1] // 2 - 1
     return concatenate([x[..., :d], x[..., d + 1 : -1]])
-
-
-def _symbols(system: HamiltonianSystem) -> Any:
-    """H in symbols, of a lattice or pairs with all terms one by one."""
-    return system.written if system.local is None else system.local.spelled
-
-
-def _expression(system: HamiltonianSystem, c: float) -> Any:
-    import sympy as sp
-
-    from sympflow.hamiltonian.symbolic import exact
-
-    symbols = _symbols(system)
-    B = sp.Symbol(f"p{symbols.ndof + 1}", real=True)
-    return sp.log(symbols.T + B) - sp.log(exact(c) - symbols.V)
 
 
 class _Logarithmic(Definition):

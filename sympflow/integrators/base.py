@@ -36,7 +36,6 @@ class FixedStep(Integrator):
     """
 
     dt: float | None = None
-
     finds_events: ClassVar[bool] = True
     on_grid: ClassVar[bool] = True
     follows: ClassVar[bool] = False

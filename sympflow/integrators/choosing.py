@@ -40,7 +40,6 @@ ENOUGH, MOST = 0.2, 0.7  # of the tolerance: errors with which a step is taken
 NEAR_POLE = tuple(10.0**-k for k in range(1, 7))
 LOGARITHMIC = 0.9  # ratio of differences of V at these distances from a pole, at least: of a logarithm 1
 NEWTON_STEPS, MOST_CENTERS = 8, 12  # of places that are looked for, and coordinates of the motion
-
 Candidate = tuple[str, str]  # the name of a method, and why it is chosen
 CHOSEN_WITH = {"wisdom_holman": {"corrector": 17}}  # options of methods that are chosen
 RTOL = 1e-9  # of an adaptive method that is chosen

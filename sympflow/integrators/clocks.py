@@ -35,7 +35,6 @@ FEW_EVALUATIONS = 20_000  # of forces on arrays, half a second, before a run who
 EVALUATIONS_EACH = 50  # and these for each step of the physical length dt within the interval,
 STEPS_EACH = 6  # or as many as so many steps take
 COMPILED_FOR_ONE = 10  # compiled evaluations that are allowed for one on arrays, which takes a thousand times longer
-
 _transformed = kept(time_transformed)
 scale_of = kept(time_scale)
 """ds/dt where the kinetic energy is c − E, at the energy E of the system's y0, of a system and c."""
@@ -224,7 +223,10 @@ class PhysicalRun(Run):
             Grid(problem.t0, problem.t1, clock.dt)  # refuses a dt of too many steps
         self.h = self.sign * clock.new_step
         compiled = problem.backend != "array" and problem.y0.dtype == np.float64 and self.system.written is not None
-        self.most_steps = self._most_steps(COMPILED_FOR_ONE if compiled else 1)
+        stages = max(1, round(sum(clock.method.evaluations(1000, 0, 0, "numpy").values()) / 1000))
+        allowed = FEW_EVALUATIONS / stages + max(EVALUATIONS_EACH / stages, STEPS_EACH) * self.length / self.dt
+        self.most_steps = int((COMPILED_FOR_ONE if compiled else 1) * allowed)
+        """Steps after which time hardly advances: before a collision they would never end."""
         self.n_steps, self.n_extra = np.zeros(len(rows), dtype=int), 0
         self.stepper = self._stepper()
         self.elapsed, self.done = np.zeros(len(rows)), 0.0
@@ -260,13 +262,6 @@ class PhysicalRun(Run):
         for name, value in state.items():
             setattr(self, name, value)
         self.stepper = self._stepper()
-
-    def _most_steps(self, allowance: int) -> int:
-        """Steps after which time hardly advances: before a collision they would never end, so it is evaluations."""
-        made = self.clock.method.evaluations(1000, 0, 0, "numpy")
-        stages = max(1, round(sum(made.values()) / 1000))
-        nominal = self.length / self.dt
-        return int(allowance * (FEW_EVALUATIONS / stages + max(EVALUATIONS_EACH / stages, STEPS_EACH) * nominal))
 
     def chunks(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Chunks of states (N, m + 1, 2d + 2), and the last one (N,) of each trajectory, at or past its end."""

@@ -58,14 +58,10 @@ if TYPE_CHECKING:
 M = TypeVar("M", bound="Integrator")
 Steps = Iterator[tuple[np.ndarray, Array, np.ndarray]]
 """Chunks of executed steps: times (n,), states at their beginnings (n, ..., 2d), signed lengths (n,) or (n, ...)."""
-
 MOST_ENTRIES = 20_000_000
 """Entries of the Jacobians that are held at a time."""
-
 FINISHED = "The solver successfully reached the end of the integration interval."
 ENDED = "A termination event occurred."
-
-
 INTERRUPTED = "The run was interrupted after t = {t:.15g}; what was computed until then is kept."
 
 

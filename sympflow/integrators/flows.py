@@ -39,7 +39,6 @@ if TYPE_CHECKING:  # and torch, which compiled runs of flows that ship do withou
     from sympflow.flow.flow_map import FlowMap
 
 T = TypeVar("T")
-
 SEARCH, SEARCH_OF_EACH = 60_000, 2_000
 """Forces that take as long as what a run in another time needs besides, and each trajectory in a batch."""
 AT_A_TIME, AT_A_TIME_OF_EACH = 100, 600
@@ -98,7 +97,6 @@ class FlowIntegrator(FixedStep):
     """
 
     flow: Any = field(default=None, repr=False)
-
     order: ClassVar[int | None] = None
     trained: ClassVar[bool] = True
     compiles: ClassVar[bool] = True
@@ -295,7 +293,6 @@ class SympFlowIntegrator(FlowIntegrator):
 
     tol: float | None = None
     compensated: bool = False
-
     name: ClassVar[str] = "sympflow"
     source: ClassVar[str] = "A trained SympFlow: symplectic for every step length, with an exact inverse."
     symplectic: ClassVar[bool] = True
@@ -417,7 +414,6 @@ class LogSympFlow(FixedStep):
 
     shift: float | None = None
     flow: Any = field(default=None, repr=False)
-
     name: ClassVar[str] = "log_sympflow"
     order: ClassVar[int | None] = None
     symplectic: ClassVar[bool] = True

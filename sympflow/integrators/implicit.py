@@ -57,7 +57,6 @@ class Gauss(FixedStep):
     """
 
     compensated: bool = False
-
     symplectic: ClassVar[bool] = True
     compiles: ClassVar[bool] = True
     takes_friction: ClassVar[bool] = True

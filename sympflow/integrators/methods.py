@@ -98,7 +98,6 @@ TRIPLES: dict[str, Triple] = {
 """The splitting methods. `wisdom_holman` and `kepler_*` are for planets, `linear_*` have the exact linear flow,
 `*_parts` any number of parts, `tao*` are for any H, on two copies of phase space, `log_*` have steps that are equal on
 the logarithmic Hamiltonian."""
-
 CLASSES: dict[str, str] = {
     "rk45": "scipy_methods:RK45",
     "dop853": "scipy_methods:DOP853",
@@ -114,6 +113,5 @@ UNLISTED = {"log_sympflow": "flows:LogSympFlow", "projected": "projected:Project
 """Classes that stand on others: what "sympflow" resolves to for a flow in another time, and the steps of another method
 on a doubled system, projected."""
 TORCHDIFFEQ = (*ADAPTIVE, *FIXED, *MULTISTEP)
-
 NAMES = frozenset((*TRIPLES, *CLASSES, *TORCHDIFFEQ))
 """The names of all built-in methods."""

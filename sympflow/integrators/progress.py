@@ -9,7 +9,6 @@ from typing import Any
 
 Asked = bool | Callable[[Any, Any], Any]
 """The argument `progress` of long calls: True for a bar, or a function of what is done and the total."""
-
 BETWEEN = 0.1  # seconds between two times that progress is told or drawn, at least
 WIDTH = 24  # characters of the bar
 

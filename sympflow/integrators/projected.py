@@ -21,7 +21,6 @@ class Projected(FixedStep):
     """
 
     of: Any = field(default=None, repr=False)
-
     name: ClassVar[str] = "projected"
     order: ClassVar[int | None] = None
     symplectic: ClassVar[bool] = False

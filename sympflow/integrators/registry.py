@@ -21,10 +21,8 @@ if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
 T = TypeVar("T")
-
 GROUP = "sympflow.integrators"
 """The entry-point group in which a distribution announces its integrators: `name = "package.module:Class"`."""
-
 _INSTEAD = {
     "args": "values of parameters are in H, or given by `params`",
     **dict.fromkeys(("q0", "p0", "x0", "v0"), "the initial state is `y0`, [q, p] in one array"),

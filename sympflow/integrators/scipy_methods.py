@@ -57,7 +57,6 @@ class _Scipy(RungeKutta):
     max_step: float = math.inf
     first_step: float | None = None
     max_steps: int | None = None
-
     solver: ClassVar[Any]
     finds_events: ClassVar[bool] = True
     takes_infinite_end: ClassVar[bool] = True

@@ -162,7 +162,6 @@ class Splitting(FixedStep):
     shift: float | None = None
     omega: float | None = None
     corrector: int | None = None
-
     scheme: ClassVar[Scheme]
     symplectic: ClassVar[bool] = True
     compiles: ClassVar[bool] = True
@@ -418,13 +417,14 @@ def _extended_run(run: Callable[[Problem], Outcome], extension: Composition, pro
     outcome.y = extension.project(x)
     if outcome.sol is not None:
         outcome.sol = Mapped(outcome.sol, extension.project)
+    found = None
     if store is not None and "copy_distance" in store.noted:
-        noted = np.array([store.noted[name] for name in ("copy_distance", "size")])
-        outcome.stats["copy_distance"] = apart = float(_ratio(noted))
-        if apart > APART and np.all(np.asarray(outcome.status) >= 0):
-            _warn(extension, apart, "")
-    elif len(x):
-        _warn_of_distance(extension, x, outcome)
+        found = np.array([store.noted[name] for name in ("copy_distance", "size")])
+    elif len(x) and (seen := values(x)) is not None:  # under vmap those of all lanes, which come first
+        with np.errstate(all="ignore"):
+            found = np.asarray(extension.distance(seen)).max(seen.ndim - x.ndim)
+    if found is not None:
+        _note_distance(extension, found, outcome)
     if stopped is not None:
         raise stopped
     return outcome
@@ -440,32 +440,20 @@ def _noted(store: RunStore, extension: Composition, x: np.ndarray) -> np.ndarray
     return np.asarray(extension.project(x))
 
 
-def _warn_of_distance(extension: Composition, x: Array, outcome: Outcome) -> None:
-    found = values(x)  # under vmap those of all lanes, which come first
-    if found is None:
-        return
-    with np.errstate(all="ignore"):
-        ratio = _ratio(np.asarray(extension.distance(found)).max(found.ndim - x.ndim))
-    outcome.stats["copy_distance"] = float(np.nanmax(ratio)) if not np.isnan(ratio).all() else float("nan")
-    lost = (ratio > APART) & (np.asarray(outcome.status) >= 0)  # what has failed says more
+def _note_distance(extension: Composition, found: np.ndarray, outcome: Outcome) -> None:
+    """Note the largest distances of copies, beside the sizes of states, (..., 2); warn of large ones."""
+    apart, size, held = found[..., 0], found[..., 1], np.asarray(outcome.status) >= 0  # what has failed says more
+    ratio = np.where(apart == 0, 0.0, apart / np.where(size == 0, 1.0, size))
+    outcome.stats["copy_distance"] = largest = float(np.fmax.reduce(ratio, axis=None))
+    lost = (ratio > APART) & (held if ratio.ndim else held.all())
     if lost.any():
         which = "" if lost.ndim == 0 else f" of {np.count_nonzero(lost)} of {lost.size} trajectories"
-        _warn(extension, float(np.nanmax(ratio)), which)
-
-
-def _ratio(found: np.ndarray) -> np.ndarray:
-    """Distances in units of sizes, (..., 2) to (...); 0 where nothing is apart."""
-    apart, size = found[..., 0], found[..., 1]
-    return np.where(apart == 0, 0.0, apart / np.where(size == 0, 1.0, size))
-
-
-def _warn(extension: Composition, apart: float, which: str) -> None:
-    warn(
-        f"The two copies{which} that method {extension.method!r} keeps differ by up to {apart:.3g} of the size of "
-        "the states: these say little about the system. Reduce `dt`, or change `omega`, the strength by which the "
-        "copies are bound.",
-        RuntimeWarning,
-    )
+        warn(
+            f"The two copies{which} that method {extension.method!r} keeps differ by up to {largest:.3g} of the size "
+            "of the states: these say little about the system. Reduce `dt`, or change `omega`, the strength by which "
+            "the copies are bound.",
+            RuntimeWarning,
+        )
 
 
 # options -----------------------------------------------------------------------------------------
@@ -535,9 +523,10 @@ def splitting_method(
     for argument, value, known in (("splitting", splitting, SPLITTINGS), ("clock", clock, CLOCKS)):
         check_one_of(argument, value, known)
     if name is None:
-        row = _row_of(table, splitting, clock)
-        if row is not None:
-            return method_of_row(row)
+        triple = (table.name, splitting, clock)
+        rows = [name for name, row in TRIPLES.items() if (row.scheme, row.splitting, row.clock) == triple]
+        if rows and SCHEMES.get(table.name) == table:
+            return method_of_row(rows[0])
         name = "_".join([table.name, *(part for part in (splitting, clock) if part not in ("kinetic", "physical"))])
     elif not isinstance(name, str):
         raise TypeError(f"`name` must be a string, such as 'my_method'; got {type(name).__name__}.")
@@ -545,14 +534,6 @@ def splitting_method(
         taken = "is a built-in method of another table" if name in NAMES else "is empty"
         raise ValueError(f"`name` {name!r} {taken}: choose another one, as by name='my_method'.")
     return _method_of(name, table, splitting, clock)
-
-
-def _row_of(scheme: Scheme, splitting: str, clock: str) -> str | None:
-    """Return the name of a triple in `TRIPLES`, if it is there."""
-    if SCHEMES.get(scheme.name) != scheme:
-        return None
-    triple = (scheme.name, splitting, clock)
-    return next((name for name, row in TRIPLES.items() if (row.scheme, row.splitting, row.clock) == triple), None)
 
 
 @cache

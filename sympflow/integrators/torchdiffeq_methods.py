@@ -299,7 +299,6 @@ class Adaptive(Watched, RungeKutta):
     rtol: float = 1e-7
     atol: float = 1e-9
     max_num_steps: int = 5_000
-
     tableau: ClassVar[Tableau]
 
     def __post_init__(self) -> None:
@@ -426,7 +425,6 @@ class Adams(Watched):
 
     dt: float | None = None
     max_order: int = 4
-
     symplectic: ClassVar[bool] = False
 
     def __post_init__(self) -> None:

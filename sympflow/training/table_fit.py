@@ -126,7 +126,9 @@ class TableRun(SearchRun):
             rest = options.label_weight if data is not None else 0.0
             loss = Loss(system, scaling, options.residual_weight, options.matching_weight, rest)
             shape = (flow.dt, options.loss_points, options.matching_times, options.seed, flow.dtype, flow.device)
-            points_at = PointSource(domain, *shape, block=1)(0)._replace(labels=_tensors(data) if rest else None)
+            points_at = PointSource(domain, *shape, block=1)(0)
+            if rest:
+                points_at = points_at._replace(labels=tuple(torch.as_tensor(a, dtype=torch.float64) for a in data))
             parts.append((1.0, LossProblem(table, Objective(loss, flow, points_at))))
         t = np.append(flow.dt * (np.arange(fractions) + 0.5) / fractions, flow.dt)
         unseen = system, domain, options.reference_states, options.seed, Stream.REFERENCE, t
@@ -151,20 +153,15 @@ class TableRun(SearchRun):
         return self.frozen or self.whole
 
     @property
-    def most_steps(self) -> int:
-        """Iterations of each of the final fits."""
-        return self.solver.steps
-
-    @property
     def search_steps(self) -> int:
-        return min(SEARCH_STEPS, self.most_steps)
+        return min(SEARCH_STEPS, self.solver.steps)
 
     def found(self, minimum: Minimum) -> dict[str, float]:
         self.table.assign(self._continued(min(self.minima, key=lambda m: m.cost)))
         return self._record(minimum)
 
     def complete(self, session: Session) -> None:
-        finalists, frozen, steps = _distinct(self.minima)[:FINALISTS], self.frozen, self.most_steps
+        finalists, frozen, steps = _distinct(self.minima)[:FINALISTS], self.frozen, self.solver.steps
         if frozen is not None:
             for fit in filter(None, (frozen, self.weighted)):
                 common = (fit, steps, self._frozen_end, True)
@@ -195,7 +192,7 @@ class TableRun(SearchRun):
             warn(f"The flow was not fitted to `runs`, because {reason}.", RuntimeWarning)
             self.runs = None
             return False
-        common = both, min(self.most_steps, RUN_STEPS), self.whole_end, False
+        common = both, min(self.solver.steps, RUN_STEPS), self.whole_end, False
         best = min(session.each(descended, common, tables, self.whole_end, both.compiled), key=lambda m: m.cost)
         theta = runs.parameters(best.x)
         if self.fit.label_times >= self.flow.shape.degree:  # fewer would leave the polynomials open in between
@@ -350,10 +347,6 @@ def _distinct(minima: list[Minimum]) -> list[Minimum]:
         if not kept or m.cost > 1.01 * kept[-1].cost:
             kept.append(m)
     return kept
-
-
-def _tensors(data: tuple[np.ndarray, ...] | None) -> Any:
-    return None if data is None else tuple(torch.as_tensor(a, dtype=torch.float64) for a in data)
 
 
 # least squares ------------------------------------------------------------------------------------------------------

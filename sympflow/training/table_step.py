@@ -55,7 +55,7 @@ class TableStep:
         self.balanced = self._driven and not system.friction
         self._times_inverse_mass, self._friction = partial(_velocity, system, 1.0), system.friction
         if self._driven and system.friction:
-            self._friction = Friction(_extended(system.friction.matrix(system.ndof), 0.0))
+            self._friction = Friction(np.pad(system.friction.matrix(system.ndof), (0, 2)))  # none of t and s
         self._forces_of = system, level, monomials, compiled
         n, terms = len(sequence), len(monomials) or level
         kicks = [i for i in range(n) if sequence[i] == "kick"]
@@ -122,10 +122,6 @@ class TableStep:
         mean, end = self._friction.drift(p.swapaxes(-1, -2), s[:, None])
         return self._velocity(mean.swapaxes(-1, -2)), end.swapaxes(-1, -2)
 
-    def _slowing(self, p: np.ndarray) -> np.ndarray:
-        """−Γp of momenta (d, P), their rate in a drift."""
-        return np.zeros_like(p) if not self._friction else self._friction.force(p.T).T
-
     def errors(self, *given: Any) -> LabelErrors | ArrayErrors:
         """Weighted errors of labels after a step: see `LabelErrors`."""
         return ArrayErrors(self, *given) if self.loops is None else self.loops.errors(*given)
@@ -145,7 +141,8 @@ class TableStep:
                 change, p = self._drifted(p, c[i])
                 q = q + change
                 by_q[i] += self._velocity(p)
-                by_p[i] += self._slowing(p)
+                if self._friction:
+                    by_p[i] += self._friction.force(p.T).T
                 moved.append(i)
             else:
                 forces, changes = self._changes(q, by_q[moved])
@@ -198,16 +195,8 @@ class ArrayErrors:
         return split.swapaxes(-2, -3).reshape(*errors.shape[:-2], -1)
 
 
-def _extended(matrix: np.ndarray, of_time: float) -> np.ndarray:
-    """A matrix (d, d) with rows and columns of t and s, 0 but for one entry."""
-    d = len(matrix)
-    extended = np.zeros((d + 2, d + 2))
-    extended[:d, :d], extended[d, d] = matrix, of_time
-    return extended
-
-
 def _velocity(system: HamiltonianSystem, of_time: float, p: np.ndarray) -> np.ndarray:
-    """M⁻¹p of rows (..., D), extended likewise."""
+    """M⁻¹p of rows (..., D), that of t times a number, and 0 for s."""
     d = system.ndof
     return np.concatenate([system.velocity(p[..., :d]), of_time * p[..., d : d + 1], 0 * p[..., d + 1 :]], axis=-1)
 
