@@ -395,7 +395,7 @@ class Hamiltonian:
             return self.definition.kinetic_gradient(p, *self._kinetic_time(t, p))
         if self.followed_mass is not None and is_tensor(p):
             mass = self.followed_mass.to(p)
-            return p / mass if mass.ndim < 2 else p @ mass.inverse()
+            return p / mass if mass.ndim < 2 else p @ mass.inverse().mT
         if self.inverse_mass is None:
             return p
         M = like(self.inverse_mass, p)
