@@ -227,11 +227,10 @@ def in_pairs():
     ("name", "method"),
     [
         *(("chain", m) for m in ("verlet", "chin4a", "linear_srkn6b", "linear_omelyan4", "mollified_impulse", "rk4")),
-        *(("masses", m) for m in ("srkn6b", "chin4a")),
-        *(("two fields", m) for m in ("verlet", "omelyan4", "linear_srkn6b")),
+        ("masses", "srkn6b"),
+        *(("two fields", m) for m in ("omelyan4", "linear_srkn6b")),
         *(("relativistic", m) for m in ("leapfrog", "gauss_legendre4")),
-        *(("damped", m) for m in ("verlet", "chin4a")),
-        *(("pairs", m) for m in ("verlet", "chin4a")),
+        *(("damped", "verlet"), ("pairs", "chin4a")),
     ],
 )
 def test_vectors_of_large_systems_are_moved_by_the_derivative_of_the_step(name, method):
@@ -258,7 +257,5 @@ def test_a_large_lattice_has_vectors_without_matrices():
     lattice = HamiltonianSystem.lattice(bond="r**2/2 + r**4/4", shape=40_000)
     found = sympflow.sali(lattice, "srkn6b", (0, 0.5), np.random.default_rng(0).normal(size=80_000) / 3, dt=0.05)
     assert found.status == 0
-    with pytest.raises(
-        ValueError, match=r"^`system` has 40,000 degrees of freedom.*equations of an implicit step.*srkn6b"
-    ):
+    with pytest.raises(ValueError, match=r"^`system` has 40,000 degrees of freedom.*of an implicit step.*srkn6b"):
         sympflow.solve(lattice, "gauss_legendre4", (0, 0.1), np.zeros(80_000), dt=0.1)

@@ -94,18 +94,16 @@ def test_the_scene_can_be_described_and_starts_inside_its_domain(scene):
     assert system.t_span[1] > system.t_span[0]
 
 
-@pytest.mark.parametrize(
-    "scene", sorted(SCENES.keys() - {"kepler 0.999", "spring pendulum, polar", "henon_heiles_escape"})
-)
+@pytest.mark.parametrize("scene", sorted({*SCENES} - {"kepler 0.999", "spring pendulum, polar", "henon_heiles_escape"}))
 def test_the_default_step_is_sensible(scene):
-    """A method of order 8 at the default step keeps the energy to 1e-9 for 500 steps.
+    """A method of order 8 at the default step keeps the energy to 1e-9 for 200 steps.
 
     Not for a close encounter, which takes a transformation of time, nor for a solution that ends in finite time. Far
     out, where r is 1e9 times p, the coupling of Tao's two copies adds up what differs in units.
     """
     system = SCENES[scene][0]()
     method = "kahan_li8" if system.separable else "gauss_legendre8" if scene.endswith("far out") else "tao8"
-    sol = solve(system, method, (0, 500 * system.dt), backend="array", save_every=50)
+    sol = solve(system, method, (0, 200 * system.dt), backend="array", save_every=20)
     assert max_energy_error(sol) < 1e-9
 
 
@@ -124,14 +122,6 @@ def test_every_scene_is_documented(name):
     assert f"::: sympflow.systems.{SYSTEMS[name].__name__}\n" in (docs / "reference" / "systems.md").read_text(
         encoding="utf-8"
     )
-
-
-def test_parameters_of_a_scene_on_the_command_line():
-    (scene,) = scenes(["spring-pendulum", "--k", "1e4", "--coordinates=polar"])
-    assert not scene.system.separable
-    assert scene.system.params["k"] == 1e4
-    assert scene.key == "spring-pendulum-k=10000-coordinates=polar"
-    assert scenes(["fput:omega=10:m=2"])[0].system.ndof == 4
 
 
 def test_kepler_comes_back_after_every_period():
@@ -210,9 +200,7 @@ def test_on_the_separatrix_of_the_double_well():
 def test_on_the_separatrix_of_the_pendulum():
     t = np.linspace(0, 8, 33)
     sol = solve(systems.pendulum_separatrix(), "dop853", (0, 8), t_eval=t, rtol=1e-13, atol=1e-14)
-    np.testing.assert_allclose(
-        sol.y, [4 * np.arctan(np.exp(t)) - math.pi, 2 / np.cosh(t)], atol=1e-14 * math.exp(8) * 10
-    )
+    np.testing.assert_allclose(sol.y, [4 * np.arctan(np.exp(t)) - np.pi, 2 / np.cosh(t)], atol=1e-13 * math.exp(8))
     below, above = (solve(systems.pendulum_separatrix(E), "kahan_li8", (0, 50)).y[0] for E in (1.99, 2.01))
     assert abs(below).max() < math.pi
     assert above[-1] > 4 * math.pi
@@ -267,12 +255,6 @@ def test_the_toda_lattice_keeps_the_eigenvalues_of_laxs_matrix(n):
     assert system.domain.contains(sol.states).all()
 
 
-def test_the_toda_lattice_has_no_quadratic_terms():
-    """exp(q₁ − q₂) is no monomial."""
-    with pytest.raises(ValueError, match=r"^`system` 'toda_lattice' has no linear part"):
-        solve(systems.toda_lattice(), "impulse", (0, 1))
-
-
 def test_the_toda_lattice_of_three_is_henon_heiles_to_third_order():
     """With differences (2q₂ + 2√3q₁, 2q₂ − 2√3q₁, −4q₂) of neighbours, V/24 is the potential of Hénon and Heiles."""
     toda, hh = systems.toda_lattice(3), systems.henon_heiles()
@@ -290,9 +272,8 @@ def test_the_pythagorean_bodies_meet_as_they_should():
     """The closest approach, at t = 15.8299."""
     sol = solve(systems.three_body(), "dop853", (0, 16), rtol=1e-13, atol=1e-14)
     bodies = sol.states[:, :6].reshape(-1, 3, 2)
-    distance = np.min(
-        [np.linalg.norm(bodies[:, i] - bodies[:, j], axis=1) for i, j in ((0, 1), (0, 2), (1, 2))], axis=0
-    )
+    distances = [np.linalg.norm(bodies[:, i] - bodies[:, j], axis=1) for i, j in ((0, 1), (0, 2), (1, 2))]
+    distance = np.min(distances, axis=0)
     assert distance.min() == pytest.approx(4.14e-4, rel=0.01)
     assert sol.t[distance.argmin()] == pytest.approx(15.8299, abs=2e-4)
 
