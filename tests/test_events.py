@@ -298,26 +298,6 @@ def test_without_dense_output_events_are_refused():
         solve(OSCILLATOR, sparse, (0, 1), START, events=zero_q)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "error", "message"),
-    [
-        ({"events": 3}, TypeError, r"^`events` must be a function g\(t, y\) or a list"),
-        ({"events": [zero_q, "q"]}, TypeError, r"^`events\[1\]` must be a function"),
-        ({"events": event(zero_q, terminal=0.5)}, ValueError, r"^`events` has `terminal` = 0.5"),
-        ({"events": event(zero_q, terminal=-1)}, ValueError, r"^`events` has `terminal`"),
-        ({"events": event(zero_q, direction="up")}, ValueError, r"^`events` has `direction` = 'up'"),
-        ({"events": lambda t, y: y}, TypeError, r"^`events` must return one number"),
-        ({"events": zero_q, "event_step": 0}, ValueError, r"^`event_step` must be a positive"),
-        ({"event_step": 0.1}, ValueError, r"^`event_step` samples events, but there are none"),
-        ({"events": zero_q, "y0": [START, START]}, ValueError, r"^`events` are found along one trajectory"),
-    ],
-)
-def test_bad_arguments_are_named(arguments, error, message):
-    with pytest.raises(error, match=message) as raised:
-        solve(OSCILLATOR, **{"method": "verlet", "t_span": (0, 1), "y0": START, **arguments})
-    assert str(raised.value).endswith(".")
-
-
 def test_an_empty_list_of_events_is_an_empty_list_of_results():
     sol = solve(OSCILLATOR, "verlet", (0, 1), events=[])
     assert (sol.t_events, sol.y_events) == ([], [])
