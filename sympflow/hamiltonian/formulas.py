@@ -106,7 +106,13 @@ class TracedHamiltonian:
     samples: Mapping[str, Any] = MappingProxyType({})
 
     def __init__(
-        self, ndof: int, program: Program, separable: bool, inverse_mass: np.ndarray | None = None, timed: bool = False
+        self,
+        ndof: int,
+        program: Program,
+        separable: bool,
+        inverse_mass: np.ndarray | None = None,
+        timed: bool = False,
+        kinetic: Program | None = None,
     ) -> None:
         self.ndof, self.program, self.separable = ndof, program, separable
         self.q = tuple(Variable(f"q{i + 1}") for i in range(ndof))
@@ -119,10 +125,12 @@ class TracedHamiltonian:
         if not separable:
             self.H = Formula(program, (*times, *self.q, *self.p))
             return
-        M = np.ones(ndof) if inverse_mass is None else inverse_mass
-        M = np.diag(M) if M.ndim == 1 else M
-        self.inverse_mass = Entries(M)
-        self.T = Formula(traced(lambda *p: [_kinetic(M, p)], *(s.name for s in self.p)), self.p)
+        if kinetic is None:
+            M = np.ones(ndof) if inverse_mass is None else inverse_mass
+            M = np.diag(M) if M.ndim == 1 else M
+            self.inverse_mass = Entries(M)
+            kinetic = traced(lambda *p: [_kinetic(M, p)], *(s.name for s in self.p))
+        self.T = Formula(kinetic, self.p)
         self._set_potential(Formula(program, (*times, *self.q)))
 
     def _set_potential(self, V: Formula) -> None:
