@@ -530,8 +530,6 @@ def reversed_substeps(substeps: Substeps) -> Substeps:
     return [(b, a, c) for (b, c), a in zip([(0.0, 0.0), *kicks], [*drifts, 0.0], strict=True)]
 
 
-# symplectic correctors ---------------------------------------------------------------------------------------------
-
 CORRECTORS = range(3, 18, 2)
 """The orders in dt to which correctors remove the errors of first order in a small kick."""
 _SPACING = Fraction(7, 40)  # of the kicks, squared, in steps

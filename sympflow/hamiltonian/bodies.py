@@ -195,8 +195,6 @@ class PairsHamiltonian(LocalHamiltonian):
             terms.append(term)
         return sp.Add(*terms)
 
-    # a few of many ----------------------------------------------------------------------------------------------------
-
     @property
     def uniform(self) -> bool:  # type: ignore[override]
         return all((x == x[0]).all() for x in (self.masses, *self.columns))

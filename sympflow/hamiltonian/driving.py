@@ -22,8 +22,6 @@ from sympflow.hamiltonian.expression import ELEMENTARY
 JUMP = 1e-9  # share of the largest value by which both sides of an end of an interval differ where samples jump
 MOST_TURNS = 10_000  # periods of samples, and zeros of a function, beyond which jumps are not listed
 
-# samples -------------------------------------------------------------------------------------------
-
 
 class Samples:
     """A function of t by the polynomials of a SciPy spline, a parameter of H."""

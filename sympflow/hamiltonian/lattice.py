@@ -305,8 +305,6 @@ class LatticeHamiltonian(LocalHamiltonian):
             raise ValueError("`kinetic` has a mass that is 0 or infinite with the values in `params`: change them.")
         self.inverse_mass = inverse_mass
 
-    # the linear part ------------------------------------------------------------------------------------------------
-
     def linear_and_rest(self, interval: float) -> tuple[SpectralPart, list[Any]]:
         """The quadratic terms of sites and bonds as they are written, in normal modes, and U(q), the rest of V."""
         F, n_sites = len(self.fields), math.prod(self.shape)

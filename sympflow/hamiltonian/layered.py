@@ -66,8 +66,6 @@ class LayeredPotential:
             x = chain.between[k](a)[0] if k < len(chain.between) else a
         return np.asarray(chain.last(*columns, *x)[0])
 
-    # what stages are made of ---------------------------------------------------------------------------------------
-
     @cached_property
     def activations(self) -> list[Program]:
         """From a to σ(a), σ'(a) and σ''(a), behind each layer but the last."""

@@ -125,8 +125,6 @@ class ExactParts:
         if not (self.diagonal or self.rest[part - 1].of_positions):
             raise ValueError("`filters` cannot act on a part that depends on momenta where modes are mixed: leave out.")
 
-    # normal modes -------------------------------------------------------------------------------------
-
     def to_modes(self, y: Array) -> tuple[Array, Array]:
         """X = C⁻¹(q − c), Y = Cᵀp."""
         linear, q, p = self.linear, y[..., : self.ndof], y[..., self.ndof :]
@@ -142,8 +140,6 @@ class ExactParts:
     def by_class(self, values: Array) -> Array:
         """Values for each frequency (..., F) as values for each mode (..., d)."""
         return values[..., self.classes]
-
-    # flows ----------------------------------------------------------------------------------------------
 
     def apply(self, maps: Sequence[SubFlow], X: Array, Y: Array, t: Any = 0.0, h: Any = 0.0) -> tuple[Array, Array]:
         """The maps of a step one after another, the first first; those of parts that move in a step h from t on."""

@@ -114,8 +114,6 @@ class Frame:
         q, p = (x.reshape(*y.shape[:-1], n, 3) for x in (y[..., : 3 * n], y[..., 3 * n :]))
         return q, p / like(self.inertia[:, None], p)
 
-    # transformations ----------------------------------------------------------------------------------------------
-
     def relative(self, q: Array) -> tuple[Array, Array]:
         """Jacobi's vectors (..., n − 1, 3) of vectors of the bodies (..., n, 3), and that of the centre (..., 3)."""
         R = q[..., 0, :]
@@ -264,8 +262,6 @@ class Frame:
     def limits(self) -> np.ndarray:
         """The square of the distance of each pair that ends a run."""
         return ((self.encounter or 0.0) * self.hill_radii(*self.pairs)) ** 2
-
-    # what does not suit ---------------------------------------------------------------------------------------------
 
     def check(self, method: str) -> None:
         """Raise a ValueError where some body is no planet of the star: bound to another one, or not bound at all."""

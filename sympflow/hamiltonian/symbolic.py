@@ -396,8 +396,6 @@ class SymbolicHamiltonian(Definition):
         H = self.H if self.time is None else self.H.xreplace({self.time: sp.Symbol("t", real=True)})
         return [self.ndof, H, {name: samples.digest for name, samples in self.samples.items()}]
 
-    # generation -----------------------------------------------------------------------------------
-
     def _variables(self, name: str) -> tuple[sp.Symbol, ...]:
         return {"V": self.q, "T": self.p, "W": self.q, "drift": self.p}.get(name, self.q + self.p)
 

@@ -903,8 +903,6 @@ class HamiltonianSystem(Hamiltonian, Answering):
         """
         return self.definition.kicks(t0, t1, self.dt / 4)
 
-    # structure --------------------------------------------------------------------------------------
-
     @cached_property
     def linear_part(self) -> LinearPart:
         """The quadratic part of H: K, its frequencies, the remaining potential U, and the `stiffness`.
@@ -914,8 +912,6 @@ class HamiltonianSystem(Hamiltonian, Answering):
         from sympflow.hamiltonian.linear_part import linear_part
 
         return linear_part(self)
-
-    # identity -------------------------------------------------------------------------------------
 
     @cached_property
     def fingerprint(self) -> tuple[float, ...]:

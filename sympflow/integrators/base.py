@@ -241,9 +241,6 @@ class Recorder:
             self.search.step(t, y, t, y, lambda s: y)
 
 
-# events of integrators that do not look for them themselves ------------------------------------------
-
-
 def run_and_search(integrator: Integrator, problem: Problem, search: EventSearch) -> Outcome:
     """Run an integrator that does not look for events itself: they are sought on its dense output afterwards."""
     stopped = False

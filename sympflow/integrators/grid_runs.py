@@ -350,9 +350,6 @@ class MemoryRun(GridRun):
         return outcome
 
 
-# events ---------------------------------------------------------------------------------------------------------------
-
-
 class SearchedRun(GridRun):
     """A run of one trajectory with events: the steps of each window are searched before the next is computed."""
 
@@ -446,9 +443,6 @@ class SearchedRun(GridRun):
         repeated = stack([unfollowed(states)] * (parts - 1), axis=1)
         with np.errstate(all="ignore"):
             return self.stepper.shorter(repeated, like(lengths, repeated), t)
-
-
-# a store --------------------------------------------------------------------------------------------------------------
 
 
 class StoredRun(GridRun):

@@ -456,9 +456,6 @@ def _note_distance(extension: Composition, found: np.ndarray, outcome: Outcome) 
         )
 
 
-# options -----------------------------------------------------------------------------------------
-
-
 def _check_parts(parts: Any) -> None:
     sequence = isinstance(parts, list | tuple)
     if not sequence or not all(isinstance(part, str) for part in parts) or not parts:
