@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from dataclasses import fields as dataclass_fields
-from functools import cached_property, lru_cache
+from functools import cached_property
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, NoReturn, TypedDict, Unpack
 
@@ -993,41 +993,38 @@ COUNTED = {
 """The functions of a system that are counted, and as what."""
 
 
-def counting_view(system: HamiltonianSystem, count: Callable[[str, Array], None]) -> HamiltonianSystem:
-    """Return a view of the system that tells `count` of each evaluation of a force or a derivative of it."""
-    view = copy.copy(system)
-    vars(view).pop("between_impulses", None)  # the view itself, where there are none
-    view.__class__ = _counting_class(type(system))
-    view._original, view._count, view._inside = system, count, False  # type: ignore[attr-defined]
-    return view
+class counting_view:
+    """A view of a system that tells `count` of each evaluation of a force or a derivative of it, not of inner ones."""
 
+    def __init__(self, system: HamiltonianSystem, count: Callable[[str, Array], None]) -> None:
+        self._system, self._count = system, count
 
-@lru_cache(maxsize=64)
-def _counting_class(cls: type[HamiltonianSystem]) -> type[HamiltonianSystem]:
-    def counted(name: str) -> Callable[..., Array]:
-        def evaluate(self: Any, x: Array, *more: Array, **named: Array) -> Array:
-            function = getattr(super(view, self), name)
-            if self._inside:  # one of them may call another
-                return function(x, *more, **named)
-            self._inside = True
-            try:
-                value = function(x, *more, **named)
-            finally:
-                self._inside = False
+    @property  # type: ignore[misc]
+    def __class__(self) -> Any:
+        return type(self._system)
+
+    def __getattr__(self, name: str) -> Any:
+        found = getattr(self._system, name)
+        if name not in COUNTED:
+            return self if found is self._system else found  # as between impulses, where there are none
+
+        def evaluate(x: Array, *more: Array, **named: Array) -> Array:
+            value = found(x, *more, **named)
             self._count(COUNTED[name], x)
             return value
 
         return evaluate
 
-    view: Any = type(
-        cls.__name__,
-        (cls,),
-        {
-            **{name: counted(name) for name in COUNTED},
-            "__hash__": lambda self: hash(self._original),
-            "__eq__": lambda self, other: other is self or other is self._original,
-            "__reduce__": lambda self: (copy.copy, (self._original,)),
-            "__doc__": cls.__doc__,
-        },
-    )
-    return view
+    def __call__(self, t: Any, y: Array) -> Array:
+        value = self._system(t, y)
+        self._count(COUNTED["vector_field"], y)
+        return value
+
+    def __hash__(self) -> int:
+        return hash(self._system)
+
+    def __eq__(self, other: object) -> bool:
+        return other is self or other is self._system
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return copy.copy, (self._system,)

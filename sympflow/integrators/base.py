@@ -178,7 +178,7 @@ class OwnSteps(ArraySteps):
         self.takes_carry = _definer(type(integrator), "rollout") is FixedStep
         if counted:
             self.counts = {"force_evaluations": 0, "hessian_evaluations": 0}
-            self.problem = replace(problem, system=counting_view(problem.system, self._count))
+            self.problem = replace(problem, system=counting_view(problem.system, self._count))  # type: ignore[arg-type]
 
     def _count(self, what: str, x: Array) -> None:
         assert isinstance(self.counts, dict)
