@@ -259,18 +259,12 @@ class Code:
         """Write a call of a function that is declared only: an intrinsic, or one of the C library."""
         types = ", ".join(str(a.type) for a in args) + (f", {more.split(maxsplit=1)[0]}" if more else "")
         self.module.declare(name, f"declare {result or 'void'} @{name}({types})")
+        return self.call(f"@{name}", args, result, more)
+
+    def call(self, target: str, args: Sequence[Value], result: Type | None = None, more: str = "") -> Value:
+        """Write a call of a function, by its name or its address."""
         given = ", ".join([*(f"{a.type} {a.name}" for a in args), *([more] if more else [])])
-        return self._new(result, f"call {result or 'void'} @{name}({given})")
-
-    def call(self, name: str, args: Sequence[Value], result: Type | None = None) -> Value:
-        """Write a call of a function of the module."""
-        given = ", ".join(f"{a.type} {a.name}" for a in args)
-        return self._new(result, f"call {result or 'void'} @{name}({given})")
-
-    def call_address(self, address: Value, args: Sequence[Value], result: Type | None = None) -> Value:
-        """Write a call of a function at an address."""
-        given = ", ".join(f"{a.type} {a.name}" for a in args)
-        return self._new(result, f"call {result or 'void'} {address.name}({given})")
+        return self._new(result, f"call {result or 'void'} {target}({given})")
 
     def outlined(
         self,
@@ -284,7 +278,7 @@ class Code:
         if not self.module.has(name):
             function = self.module.function(name, [a.type for a in args], result, within=True, rare=rare)
             function.give(body(*function.arguments))
-        return self.call(name, args, result)
+        return self.call(f"@{name}", args, result)
 
     def once(self, key: Any, make: Callable[[], Sequence[Value]]) -> list[Value]:
         """The values of `make()`, or those that it gave for this key before, if they hold here."""

@@ -172,22 +172,13 @@ class Keeper(Protocol):
 
     @property
     def fields(self) -> Mapping[str, np.ndarray]: ...
-
     @property
     def status(self) -> np.ndarray: ...
-
     @property
     def messages(self) -> Mapping[Index, str]: ...
-
-    def place(self, block: Block, done: Done) -> None:
-        """Put the orbits of a block where they belong."""
-
-    def finish(self) -> None:
-        """Note that all orbits are there."""
-
-    def is_done(self, block: Block) -> bool:
-        """True if the orbits of a block are there already."""
-
+    def place(self, block: Block, done: Done) -> None: ...
+    def finish(self) -> None: ...
+    def is_done(self, block: Block) -> bool: ...
     def dataset(self) -> xarray.Dataset: ...
 
 
@@ -201,7 +192,7 @@ class Memory:
         self.messages: dict[Index, str] = {}
 
     def finish(self) -> None:
-        pass
+        """Note that all orbits are there."""
 
     def is_done(self, block: Block) -> bool:
         return False

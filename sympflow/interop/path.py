@@ -372,24 +372,6 @@ class _PulledBack(torch.autograd.Function):
         return None, *times, a, *of_parameters
 
 
-def leaves(system: HamiltonianSystem, y: Tensor, t: float) -> list[Tensor]:
-    """The leaves of the graph on which the vector field at y and t depends, other than y: a network's weights."""
-    y = y.detach()
-    if not system.definition.learns(y):
-        return []
-    found: list[Tensor] = []
-    waiting, seen = [system.vector_field(y, t).grad_fn], set()
-    while waiting:
-        node = waiting.pop()
-        if node is None or node in seen:
-            continue
-        seen.add(node)
-        if isinstance(leaf := getattr(node, "variable", None), Tensor):
-            found.append(leaf)
-        waiting += [parent for parent, _ in node.next_functions]
-    return found
-
-
 def _places(saved: np.ndarray, count: Tensor) -> Tensor:
     """The index of each count among those that were saved."""
     return torch.searchsorted(torch.as_tensor(saved, device=count.device), count)

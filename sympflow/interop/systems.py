@@ -225,17 +225,21 @@ def _trained(values: Tensor) -> bool:
     """True if values depend on tensors that require gradients: a part of a graph that gives no slope is none."""
     if not values.requires_grad:
         return False
-    nodes: list[Any] = [values.grad_fn]
-    leaves, met = [], {*nodes}
-    while nodes:
-        node = nodes.pop()
-        leaves += [node.variable] if hasattr(node, "variable") else []
-        further = {parent for parent, _ in node.next_functions if parent is not None} - met
-        met |= further
-        nodes += further
     weights = torch.rand(values.shape, dtype=values.dtype, generator=torch.Generator().manual_seed(0))
-    slopes = torch.autograd.grad((weights * values).sum(), leaves, allow_unused=True)
+    slopes = torch.autograd.grad((weights * values).sum(), leaves(values), allow_unused=True)
     return any(slope is not None and bool((slope != 0).any()) for slope in slopes)
+
+
+def leaves(values: Tensor) -> list[Tensor]:
+    """The leaves of the graph on which values depend, such as a network's weights."""
+    found: list[Tensor] = []
+    waiting, met = [values.grad_fn], set()
+    while waiting:
+        if (node := waiting.pop()) is not None and node not in met:
+            met.add(node)
+            found += [node.variable] if hasattr(node, "variable") else []
+            waiting += [parent for parent, _ in node.next_functions]
+    return found
 
 
 def _size(A: np.ndarray) -> np.ndarray:

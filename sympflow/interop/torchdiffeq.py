@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable
 from importlib import import_module
 from typing import Any
 
@@ -25,7 +24,8 @@ from sympflow.integrators.base import FixedStep, Integrator
 from sympflow.integrators.registry import available, check_applies
 from sympflow.integrators.tableaux import ADAPTIVE, FIXED
 from sympflow.interop.matching import Comparison, fixed_step
-from sympflow.interop.path import AdjointPath, BeforeStep, DensePath, Path, leaves, numbers
+from sympflow.interop.path import AdjointPath, BeforeStep, DensePath, Path, numbers
+from sympflow.interop.systems import leaves
 
 State = Tensor | tuple[Tensor, ...]
 _THEIRS = {*ADAPTIVE, *FIXED, "explicit_adams", "implicit_adams", "fixed_adams", "scipy_solver"}
@@ -85,11 +85,8 @@ def odeint(
         states and times tell, at the start and along the run.
     """
     if not _is_ours(method, func, options):
-        options = _landing(func, t, method, options, event_fn is not None)
-        with _names_of_both():
-            return torchdiffeq.odeint(
-                _of_pairs(func, y0), y0, t, rtol=rtol, atol=atol, method=method, options=options, event_fn=event_fn
-            )
+        asked = {"rtol": rtol, "atol": atol, "method": method, "options": options, "event_fn": event_fn}
+        return _theirs(torchdiffeq.odeint, func, y0, t, over=t, endless=event_fn is not None, **asked)
     return _integrated(Path, func, y0, t, rtol, atol, method, options, event_fn)
 
 
@@ -157,11 +154,10 @@ def odeint_dense(
         From the result, for a t that is not between t0 and t1.
     """
     if not _is_ours(method, func, options):
-        with _names_of_both():
-            if method not in (None, "dopri5"):
-                raise ValueError(f"`method` {method!r} has no dense output in torchdiffeq: use 'dopri5', or ours.")
-            options = _landing(func, torch.as_tensor([float(t0), float(t1)]), method, options)
-            return torchdiffeq.odeint_dense(func, y0, t0, t1, rtol=rtol, atol=atol, method=method, options=options)
+        if method not in (None, "dopri5"):
+            raise ValueError(f"`method` {method!r} has no dense output in torchdiffeq: use 'dopri5', or ours.")
+        asked = {"rtol": rtol, "atol": atol, "method": method, "options": options}
+        return _theirs(torchdiffeq.odeint_dense, func, y0, t0, t1, over=torch.tensor([float(t0), float(t1)]), **asked)
     if not isinstance(y0, Tensor):
         raise TypeError(f"`y0` must be a tensor [q, p], as in torchdiffeq's odeint_dense; got {type(y0).__name__}.")
     times = torch.stack(
@@ -202,10 +198,8 @@ def odeint_event(
         theirs = torchdiffeq.odeint if odeint_interface is odeint else odeint_interface
         begin = float(one_lane(t0).reshape(-1)[0])
         interval = torch.tensor([begin, begin + (-1.0 if reverse_time else 1.0)], dtype=torch.float64)
-        kwargs["options"] = _landing(func, interval, kwargs.get("method"), kwargs.get("options"), True)
-        arguments = {"event_fn": event_fn, "reverse_time": reverse_time, "odeint_interface": theirs, **kwargs}
-        with _names_of_both():
-            return torchdiffeq.odeint_event(_of_pairs(func, y0), y0, t0, **arguments)
+        kwargs |= {"event_fn": event_fn, "reverse_time": reverse_time, "odeint_interface": theirs}
+        return _theirs(torchdiffeq.odeint_event, func, y0, t0, over=interval, endless=True, **kwargs)
     adjoint = odeint_interface in (odeint_adjoint, torchdiffeq.odeint_adjoint)
     if not (adjoint or odeint_interface in (odeint, torchdiffeq.odeint)):
         raise ValueError("`odeint_interface` must be odeint or odeint_adjoint, of torchdiffeq or of this module.")
@@ -256,12 +250,10 @@ def odeint_adjoint(
         `torch.func`: this is for reverse mode, `backward` and `torch.autograd.grad`.
     """
     if not _is_ours(method, func, options):
-        options = _landing(func, t, method, options, event_fn is not None)
-        arguments: dict[str, Any] = {"rtol": rtol, "atol": atol, "method": method, "options": options}
-        arguments |= {"event_fn": event_fn, "adjoint_rtol": adjoint_rtol, "adjoint_atol": adjoint_atol}
-        arguments |= {"adjoint_method": adjoint_method, "adjoint_options": adjoint_options}
-        with _names_of_both():
-            return torchdiffeq.odeint_adjoint(func, y0, t, adjoint_params=adjoint_params, **arguments)
+        asked: dict[str, Any] = {"rtol": rtol, "atol": atol, "method": method, "options": options, "event_fn": event_fn}
+        asked |= {"adjoint_rtol": adjoint_rtol, "adjoint_atol": adjoint_atol, "adjoint_method": adjoint_method}
+        asked |= {"adjoint_options": adjoint_options, "adjoint_params": adjoint_params}
+        return _theirs(torchdiffeq.odeint_adjoint, func, y0, t, over=t, endless=event_fn is not None, **asked)
     if adjoint_method is not None and _name(adjoint_method) != _name(method):
         raise ValueError(
             f"`adjoint_method` is {_name(adjoint_method)!r}, but the gradients of {_name(method)!r} are those of its "
@@ -279,12 +271,10 @@ def odeint_adjoint(
 
     def make_path(integrator: FixedStep, system: HamiltonianSystem | None, y: Tensor, *more: Any, **named: Any) -> Path:
         start = float(one_lane(t)[0])
-        own = [] if adjoint_params is not None or system is None else leaves(system, y, start)
-        parameters = (*(given or ()), *own)
+        learns = system is not None and system.definition.learns(y)
+        field = [system.vector_field(unfollowed(y), start)] if system is not None and learns else []
+        parameters = (*(given or ()), *(leaf for slope in field if adjoint_params is None for leaf in leaves(slope)))
         flow = integrator.flow_for(system)  # type: ignore[arg-type]
-        field = (
-            [system.vector_field(unfollowed(y), start)] if system is not None and system.definition.learns(y) else []
-        )
         if transformed(y, t, *field, *parameters, *(() if flow is None else flow.parameters())):
             raise TypeError(
                 "`odeint_adjoint` is for reverse mode, backward() and torch.autograd.grad: in forward mode, and inside "
@@ -322,11 +312,11 @@ def register(method: str) -> None:
     table[method] = type(f"{method.title()}Solver", (_Solver,), {"method": method})
 
 
-@contextmanager
-def _names_of_both() -> Iterator[None]:
-    """torchdiffeq knows its own methods only: a name that neither has is answered with ours as well."""
+def _theirs(run: Any, func: Any, y0: Any, *where: Any, over: Any, endless: bool = False, **asked: Any) -> Any:
+    """A run by torchdiffeq's own method over some times; a name that neither has is answered with ours as well."""
+    asked["options"] = _landing(func, over, asked.get("method"), asked.get("options"), endless)
     try:
-        yield
+        return run(_of_pairs(func, y0), y0, *where, **asked)
     except ValueError as error:
         if not str(error).startswith("Invalid method"):
             raise
@@ -575,14 +565,6 @@ def _of_pairs(func: Any, y0: Any) -> Any:
     return of_pair
 
 
-def _no_adjoint(method: Any) -> ValueError:
-    return ValueError(
-        f"`method` {_name(method)!r} cannot be used with torchdiffeq's own odeint_adjoint, which integrates the "
-        "derivative of `func` backward: that is not the derivative of the map that was run, and never sees a flow's "
-        "weights. Use odeint_adjoint of sympflow.interop.torchdiffeq, whose gradients are those of the map."
-    )
-
-
 # our methods in torchdiffeq's own, private table: only by `register` ----------------------------------------
 
 
@@ -603,7 +585,12 @@ class _Solver:
 
     def __init__(self, func: Any, y0: Tensor, rtol: Any, atol: Any, **options: Any) -> None:
         if _within_adjoint():
-            raise _no_adjoint(self.method)
+            raise ValueError(
+                f"`method` {self.method!r} cannot be used with torchdiffeq's own odeint_adjoint, which integrates the "
+                "derivative of `func` backward: that is not the derivative of the map that was run, and never sees a "
+                "flow's weights. Use odeint_adjoint of sympflow.interop.torchdiffeq, whose gradients are those of the "
+                "map."
+            )
         self.direction, shapes, announced = 1, None, func
         while type(func).__module__.startswith("torchdiffeq"):
             self.direction = -1 if type(func).__name__ == "_ReverseFunc" else self.direction

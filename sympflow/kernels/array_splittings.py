@@ -108,7 +108,7 @@ class Functions(Forces):
             room.store(float("nan"), i, out)  # what a function does not write ends the run
         address = code.load(room.data(0), order, POINTER)
         time = letters[0] if letters else code.constant(0.0)
-        code.call_address(address, [time, given[0], given[-1], out, d])
+        code.call(address.name, [time, given[0], given[-1], out, d])
 
 
 def term_code(splitting: Splitting) -> ArrayCode:

@@ -225,7 +225,8 @@ class KeplerCode(Rollouts):
         def added(j: Value, total: list[Value]) -> list[Value]:
             d = [p - y for p, y in zip(vector(0, j), h, strict=True)]
             distance = dot(d, d)
-            w = code.splat(code.load(room.data(0), self._of_mass(j)), LANES) / (distance * sqrt(distance))
+            place = j + (j >> LANES_SHIFT) * (LANES * (len(ROWS) - 1))  # of G m in the table
+            w = code.splat(code.load(room.data(0), place), LANES) / (distance * sqrt(distance))
             limit = code.splat(code.load(room.data(4), j), LANES)
             return [
                 code.apply("min", (total[0], distance - limit)),
@@ -245,11 +246,6 @@ class KeplerCode(Rollouts):
         for y, change in zip(state, drifted(x, values(state[AXES:]), mu, drift, r, 1.0 / r), strict=True):
             y.add(change)
         self._write(room, place, state)
-
-    def _of_mass(self, j: Value) -> Value:
-        """The place of G m of planet j in the table."""
-        group = j >> LANES_SHIFT
-        return j + group * (LANES * (len(ROWS) - 1))
 
     def _with_extra(self, room: Room, a: Vectors, h: Vectors) -> Vectors:
         """Accelerations of bodies at places h from the star, with those by the extra potential."""
@@ -309,7 +305,7 @@ class KeplerCode(Rollouts):
             a[g] = [p - pull * y for p, y in zip(a[g], h[g], strict=True)]
             own = own * inverses[g] * inverses[g] * inverses[g]
             weighted = [c[g]["mass"] * p for p in a[g]]
-            outer = [of_lanes(_suffix, p) + q for p, q in zip(weighted, behind, strict=True)]
+            outer = [of_lanes(partial(_running, back=True), p) + q for p, q in zip(weighted, behind, strict=True)]
             behind = [q + of_lanes(_whole, p) for p, q in zip(weighted, behind, strict=True)] if g else behind
             new.append(
                 [c[g]["ratio"] * p + c[g]["over"] * q + own * y for p, q, y in zip(a[g], outer, x[g], strict=True)]
@@ -332,7 +328,7 @@ class KeplerCode(Rollouts):
         before: Vectors = []
         for g, group in enumerate(x):
             weighted = [c[g]["weight"] * y for y in group]
-            inner = [of_lanes(_prefix, w) for w in weighted]
+            inner = [of_lanes(partial(_running, back=False), w) for w in weighted]
             if g:
                 inner = [p + b for p, b in zip(inner, before, strict=True)]
             h.append([y + p for y, p in zip(group, inner, strict=True)])
@@ -401,19 +397,15 @@ def turned(x: Any, lanes: Sequence[int]) -> Any:
     return of_lanes(lambda y: y.code.shuffle(y, y.code.constant(0.0, y.type), lanes), x)
 
 
-def _prefix(x: Value) -> Value:
-    """The sum of all lanes before each."""
-    s = turned(x, [LANES, *range(LANES - 1)])
-    for k in (1, 2, 4):
-        s = s + turned(s, [LANES] * k + [*range(LANES - k)])
-    return s
+def _running(x: Value, back: bool) -> Value:
+    """The sum of all lanes before each, or behind it."""
 
+    def moved(y: Value, k: int) -> Value:
+        return turned(y, [*range(k, LANES), *[LANES] * k] if back else [*[LANES] * k, *range(LANES - k)])
 
-def _suffix(x: Value) -> Value:
-    """The sum of all lanes behind each."""
-    s = turned(x, [*range(1, LANES), LANES])
+    s = moved(x, 1)
     for k in (1, 2, 4):
-        s = s + turned(s, [*range(k, LANES)] + [LANES] * k)
+        s = s + moved(s, k)
     return s
 
 

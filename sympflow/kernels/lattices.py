@@ -26,14 +26,13 @@ from sympflow.compiler.machine import address
 from sympflow.compiler.program import Program, Traced, derivatives, gradient, reached, tangent, traced
 from sympflow.hamiltonian.formulas import evaluator
 from sympflow.hamiltonian.lattice import LatticeHamiltonian
-from sympflow.hamiltonian.local import LocalHamiltonian
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.kernels.rollouts import aligned, zeros
 from sympflow.kernels.runs import Numbers, Room
 from sympflow.kernels.teams import Member, SharedMemory, SharedRollouts, meet
 from sympflow.schemes import CURVATURE, POLYNOMIAL
 
-__all__ = ["LatticeCode", "lattice_code"]
+__all__ = ["LatticeCode"]
 
 Key = Any
 """A number of a site: its kind, and which one of these."""
@@ -511,16 +510,18 @@ class _Scene:
     def _ghosts(self, x: Value, depth: int) -> None:
         """Places before and behind the slabs of a row, taken from the lanes beside."""
         code, places, W = self.code, self.numbers["places"], self.width
-        full, follows = (partial(self._chosen, name) for name in ("full", "follows"))
+
+        def chosen(name: str, yes: Value, no: Value) -> Value:
+            return code.select(code.load(self.address(name), 0, self.bits) < 0, yes, no)
 
         def ends(k: Value) -> None:
-            for chosen, yes, no, order, at in (
-                (full, places - 1 - k, places - 2 - k, [W - 1, *range(W - 1)], code.constant(-1, INT) - k),
-                (follows, k, k + 1, [*range(1, W), 0], places + k),
+            for name, yes, no, order, at in (
+                ("full", places - 1 - k, places - 2 - k, [W - 1, *range(W - 1)], code.constant(-1, INT) - k),
+                ("follows", k, k + 1, [*range(1, W), 0], places + k),
             ):
                 ghost = code.load(x, yes * W, self.type)
                 if not self.form.even:
-                    ghost = code.select(chosen(), ghost, code.load(x, no * W, self.type))
+                    ghost = chosen(name, ghost, code.load(x, no * W, self.type))
                 ghost = code.shuffle(ghost, ghost, order)
                 if self.form.boundary[-1] == "fixed":
                     ghost = self.within(ghost, code.load(self.inside(self.n_axes - 1), at * W, self.bits))
@@ -532,9 +533,6 @@ class _Scene:
         else:
             with code.over(depth) as k:
                 ends(k)
-
-    def _chosen(self, name: str) -> Value:
-        return self.code.apply("lt", (self.code.load(self.address(name), 0, self.bits), 0))
 
     def _ghosts_of_pieces(self, f: int, depth: int) -> None:
         """The same of the first slab and the last one, taken from other pieces."""
@@ -813,7 +811,8 @@ class Slabs:
 
     def __init__(self, lattice: LatticeHamiltonian, stages: LatticeStages, order: Sequence[int], pieces: int) -> None:
         form, W, R, one_axis = stages.form, stages.form.width, stages.form.reach, len(order) == 1
-        shape, strides = ([sizes[a] for a in order] for sizes in (lattice.shape, _strides(lattice.shape)))
+        steps = [int(np.prod(lattice.shape[k + 1 :], dtype=np.int64)) for k in range(len(order))]
+        shape, strides = ([sizes[a] for a in order] for sizes in (lattice.shape, steps))
         slabs = np.arange(W * (pieces if one_axis else 1) + 1) * shape[-1] // (W * (pieces if one_axis else 1))
         starts, sizes = slabs[:-1].reshape(-1, W), np.diff(slabs).reshape(-1, W)
         bounds = np.zeros(2, dtype=int) if one_axis else np.arange(pieces + 1) * shape[0] // pieces
@@ -907,28 +906,18 @@ def _mask(x: np.ndarray) -> np.ndarray:
     return bits
 
 
-def _strides(shape: Sequence[int]) -> list[int]:
-    return [int(np.prod(shape[k + 1 :], dtype=np.int64)) for k in range(len(shape))]
-
-
-def lattice_code(
-    local: LocalHamiltonian, damped: bool, level: int, compensated: bool, monomials: Monomials = ()
-) -> LatticeCode:
-    """The compiled functions of a lattice; `damped` if there is friction −γp."""
-    assert isinstance(local, LatticeHamiltonian)
-    return LatticeCode(local, level, compensated, damped)
-
-
 class LatticeCode(SharedRollouts):
     """The compiled functions of schemes on one lattice, `damped` by −γp: its form alone is part of the code."""
 
-    def __init__(self, lattice: LatticeHamiltonian, level: int, compensated: bool, damped: bool) -> None:
+    def __init__(
+        self, lattice: LatticeHamiltonian, damped: bool, level: int, compensated: bool, monomials: Monomials = ()
+    ) -> None:
         if level == POLYNOMIAL:
             raise NotCompiled(
                 "`scheme` has polynomials, which are of systems by their coordinates one by one: use backend='array'."
             )
         super().__init__(2 * lattice.ndof * (1 + compensated), 2 * lattice.ndof)
-        self._given = lattice, level, compensated, damped
+        self._given = lattice, damped, level, compensated
         self._order, width = arrangement(lattice)
         n, one_axis = lattice.shape[self._order[-1]], len(lattice.shape) == 1
         depth = max(1, max(lattice.bonds, default=0) * (1 + level))
@@ -960,7 +949,7 @@ class LatticeCode(SharedRollouts):
         found = np.zeros(threads, dtype=np.int64)
         shared = [address(x) for x in (meeting, stop, found)]
         contexts = slabs.contexts([*map(address, rooms)], [*map(address, helpers)], block, shared)
-        return lambda k: Member(rooms[k], contexts[k], (slabs, helpers, found))
+        return lambda k: (rooms[k], contexts[k], (slabs, helpers, found))
 
 
 WORTH_A_PIECE = 16_384

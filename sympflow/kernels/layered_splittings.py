@@ -17,11 +17,13 @@ from typing import Any
 
 import numpy as np
 
+from sympflow.compiler import NotCompiled
 from sympflow.compiler.control import INT, Type, Value
 from sympflow.compiler.functions import dot, fma
 from sympflow.compiler.machine import address
 from sympflow.compiler.program import Program
 from sympflow.hamiltonian.layered import LayeredPotential
+from sympflow.hamiltonian.monomials import Monomials
 from sympflow.kernels.rollouts import LINE, Columns, SplittingRollouts, zeros
 from sympflow.kernels.runs import Numbers, Room, Values, step_function
 
@@ -37,7 +39,11 @@ class LayeredCode(SplittingRollouts):
     lanes = 16
     size = 2
 
-    def __init__(self, potential: LayeredPotential) -> None:
+    def __init__(
+        self, potential: LayeredPotential, level: int = 0, compensated: bool = False, monomials: Monomials = ()
+    ) -> None:
+        if compensated:
+            raise NotCompiled("`compensated` sums are not compiled for weights that torch follows: leave it out.")
         super().__init__(2 * potential.ndof, 2 * potential.ndof)
         self._potential, self._given = potential, (potential,)
 

@@ -83,15 +83,14 @@ class MLPFlowKernel(Kernel):
     def step(self, h: ArrayLike, y: np.ndarray, t: ArrayLike = 0.0) -> Steps:
         """ψ̄_h of each row of `y` (N, 2d), each with its own h (N,), negative for the inverse."""
         lengths = np.broadcast_to(np.asarray(h, dtype=np.float64), len(y))
-        return Steps(
-            both_ways(lambda rows, back: self._steps(-1.0 if back else 1.0, y[rows], lengths[rows]), lengths, y)
-        )
 
-    def _steps(self, sign: float, y: np.ndarray, h: np.ndarray) -> np.ndarray:
-        """Steps of one sign."""
-        batch = Batch.whole(np.concatenate([y, np.abs(h)[:, None]], axis=1), 1, ONE, y.shape[1])
-        run_rows(lambda i, _: self._rollouts.run(sign, batch.rows(i.start, i.stop), False), len(y), STEP, None)
-        return batch.out[:, 0]
+        def one_way(rows: Any, back: bool) -> np.ndarray:
+            start, sign = np.concatenate([y[rows], np.abs(lengths[rows])[:, None]], axis=1), -1.0 if back else 1.0
+            batch = Batch.whole(start, 1, ONE, y.shape[1])
+            run_rows(lambda i, _: self._rollouts.run(sign, batch.rows(i.start, i.stop), False), len(start), STEP, None)
+            return batch.out[:, 0]
+
+        return Steps(both_ways(one_way, lengths, y))
 
 
 class _Layout(NamedTuple):
@@ -331,5 +330,5 @@ def _called(address: Value, a: Value) -> tuple[Value, Value]:
     code, n = a.code, a.type.width
     given, values, slopes = (code.memory(1, a.type) for _ in range(3))
     code.store(a, given)
-    code.call_address(address, [code.constant(n, INT), given, values, slopes])
+    code.call(address.name, [code.constant(n, INT), given, values, slopes])
     return code.load(values, 0, a.type), code.load(slopes, 0, a.type)

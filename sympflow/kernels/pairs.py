@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from sympflow.hamiltonian.monomials import Monomials
     from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 
-__all__ = ["PairCode", "PairForces", "few", "pair_code"]
+__all__ = ["PairCode", "PairForces", "few"]
 
 KINDS = {"gradient": (1,), "hessian_vector": (1, 2), "bend": (2, 3)}
 """The derivatives of V by s that are in ∇V, ∇²V·v and ½ ∇³V(v, v)."""
@@ -496,14 +496,6 @@ class PairSums(Forces):
                 code.store(code.load(F, at) + code.total(variable.value), F, at)
 
 
-def pair_code(
-    local: LocalHamiltonian, damped: bool, level: int, compensated: bool, monomials: Monomials = ()
-) -> PairCode:
-    """The compiled functions of more bodies than a few; `damped` if there is friction −γp."""
-    assert isinstance(local, PairsHamiltonian)
-    return PairCode(local, level, compensated, damped)
-
-
 def _check_level(level: int) -> None:
     if level == POLYNOMIAL:
         raise NotCompiled("`scheme` has polynomials, which need a symbolic system: take one without them.")
@@ -512,9 +504,11 @@ def _check_level(level: int) -> None:
 class PairCode(SharedRollouts):
     """The compiled functions of schemes on bodies, `damped` by −γp: the potential alone is part of the code."""
 
-    def __init__(self, local: PairsHamiltonian, level: int, compensated: bool, damped: bool) -> None:
+    def __init__(
+        self, local: PairsHamiltonian, damped: bool, level: int, compensated: bool, monomials: Monomials = ()
+    ) -> None:
         _check_level(level)
-        self._given = local, level, compensated, damped
+        self._given = local, damped, level, compensated
         self._local = local
         self._stages = PairSums(local, level, compensated, damped)
         self._sets = 4 if compensated else 2
@@ -549,7 +543,7 @@ class PairCode(SharedRollouts):
             arrays["work"] = zeros(ARRAYS * dim * size)
             numbers = sizes | {"member": k} | {name: address(x) for name, x in arrays.items()}
             context = np.array([numbers[name] for name in FIELDS], dtype=np.int64)
-            return Member(aligned(3 * sets * dim * size), context, arrays)
+            return aligned(3 * sets * dim * size), context, arrays
 
         return member
 

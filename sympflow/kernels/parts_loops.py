@@ -451,13 +451,10 @@ def merge(one: SubFlow, other: SubFlow) -> SubFlow | None:
     """The map that is `other` after `one`, if it is one map."""
     if one.part != other.part:
         return None
-    if one.part != LINEAR and not _same(one.filters, other.filters):
+    filters, others = (np.zeros(0) if m.filters is None else m.filters for m in (one, other))
+    if one.part != LINEAR and not np.array_equal(filters, others):
         return None
     return SubFlow(one.part, one.length + other.length, one.gradient + other.gradient, one.filters)
-
-
-def _same(a: Any, b: Any) -> bool:
-    return (a is None and b is None) or (a is not None and b is not None and np.array_equal(a, b))
 
 
 def row_products(A: np.ndarray, x: np.ndarray) -> np.ndarray:

@@ -48,11 +48,6 @@ class Task(NamedTuple):
     t0: float = 0.0
     threads: int | None = None
 
-    @property
-    def goes_on(self) -> bool:
-        """True if the run goes on from a place where it was cut."""
-        return self.carry is not None and self.carry.running is not None
-
 
 class Run(NamedTuple):
     """The outcome of a run of compiled steps.

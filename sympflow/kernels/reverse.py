@@ -65,11 +65,6 @@ class Recorded:
         width = self._width(n_rows)
         return aligned(-(-n_rows // width) * width * (n_steps * self._link + 1) * self._code.n_values)
 
-    def _saved(self, first: int, to: int) -> slice:
-        """The outputs of the steps from `first` to `to`, with the first state those of all."""
-        low, high = self._save.searchsorted((first, to), "right").tolist()
-        return slice(low if first else 0, high)
-
     def _run(self, i: slice, stop: np.ndarray) -> None:
         """Run some rows, segment by segment: each begins with what the one before leaves."""
         code, n = self._code, i.stop - i.start
@@ -77,7 +72,11 @@ class Recorded:
         running, finite = np.empty((n, 0 if self._whole else code.n_values - code.counted)), self.n_finite[i]
         for first, to in pairwise(self._ends):
             history.append(self._room(n, to) if self._whole else running.copy())
-            chosen, kept = self._saved(first, to), history[-1] if self._whole else None
+            low, high = self._save.searchsorted((first, to), "right").tolist()
+            chosen, kept = (
+                slice(low if first else 0, high),
+                history[-1] if self._whole else None,
+            )  # with the first state
             found = np.empty_like(finite) if first else finite
             states = self.states[i, chosen]
             code.run(

@@ -149,18 +149,13 @@ class Rollouts(ABC):
         return None if self.room is None else self.memory
 
     def function(self, name: str, width: int) -> Callable[..., None]:
-        """The compiled function of a name, see `made`."""
-        return self.kept((name, width), lambda: self.made(name, width))
-
-    def kept(self, key: Any, make: Callable[[], Callable[..., None]]) -> Callable[..., None]:
-        """The result of `make`, made once for each key."""
-        found = self._functions.get(key)
-        if found is None:
+        """The compiled function of a name, see `made`; made once."""
+        key = name, width
+        if key not in self._functions:
             with self._lock:
-                found = self._functions.get(key)
-                if found is None:
-                    found = self._functions[key] = make()
-        return found
+                if key not in self._functions:
+                    self._functions[key] = self.made(name, width)
+        return self._functions[key]
 
     def made(self, name: str, width: int) -> Callable[..., None]:
         """Compile the function of a name: "run", "kept", "reverse" or "slopes", each " own" too, or "map"."""

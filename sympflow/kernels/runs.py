@@ -190,7 +190,7 @@ def reverse_function(
     with code.over(groups(code, n_rows, width)) as group:
         begin, length = group * width, (link + 2) * (size * width)
         place = code.at(table, group * length) if own else table
-        column = ColumnStage(code, place, kinds, size, width if own else 1, width, _no_stage)
+        column = ColumnStage(code, place, kinds, size, width if own else 1, width, lambda *_: None)
         found = code.at(derivatives, group * length)
         history = _History(code, kept, group, (n_steps - first) * link, n_values, width)
         cotangents = [code.variable(x) for x in lanes.loaded(rows, begin, n_rows)]
@@ -563,10 +563,6 @@ class _Registers(Memory):
         with self._each() as c:
             alive = self.code.apply("eq", (self._watch[c], 0.0))
             _mark(self.code, alive, n, finite, begin + c * self.width, n_rows)
-
-
-def _no_stage(*_: Any) -> Any:
-    """The stage of a column that is read for its numbers only."""
 
 
 def groups(code: Code, n_rows: Value, width: int) -> Value:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property, lru_cache, partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 from weakref import ref
 
 import numpy as np
@@ -24,7 +24,6 @@ from sympflow.schemes import CURVATURE, FORCE_GRADIENT, Scheme
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.friction import Friction
-    from sympflow.hamiltonian.layered import LayeredPotential
     from sympflow.kernels.approximations import Ranges
     from sympflow.kernels.reverse import Recorded
     from sympflow.kernels.rollouts import SplittingRollouts
@@ -114,25 +113,23 @@ class SplittingLoops:
             given = gradient, hessian_vector, system.inverse_mass, self.driven
             ndim = None if system.damping is None else system.damping.ndim
             self._compile = partial(function_code, system.ndof, *given, ndim)
-        elif system.local is not None:
+        elif (local := cast(Any, system.local)) is not None:
             if system.damping is not None and system.damping.ndim:
                 raise NotCompiled(
                     f"`system` {system.name!r} has friction, and its loops take one rate for all momenta: use "
                     "backend='array'."
                 )
-            if system.local.arrays_only:
-                raise NotCompiled(
-                    f"`system` has {system.local.arrays_only}, whose kicks are array operations: use 'array'."
-                )
-            if system.local.loops == "pairs":
-                from sympflow.kernels.pairs import few, pair_code
+            if local.arrays_only:
+                raise NotCompiled(f"`system` has {local.arrays_only}, whose kicks are array operations: use 'array'.")
+            if local.loops == "pairs":
+                from sympflow.kernels.pairs import PairCode, few
 
-                self._written, self.values = few(system.local)
-                self._compile = partial(pair_code, system.local, bool(system.friction))
+                self._written, self.values = few(local)
+                self._compile = partial(PairCode, local, bool(system.friction))
             else:
-                from sympflow.kernels.lattices import lattice_code
+                from sympflow.kernels.lattices import LatticeCode
 
-                self._compile = partial(lattice_code, system.local, bool(system.friction))
+                self._compile = partial(LatticeCode, local, bool(system.friction))
             self._has_force_gradient = system.quadratic_kinetic
             self.traced = self._written is not None
         elif system.layered is not None:
@@ -142,7 +139,9 @@ class SplittingLoops:
                 )
             self._has_force_gradient, self.tensors = False, system.layered.tensors
             self.work = system.layered.n_weights
-            self._compile = partial(_layered_code, system.layered)
+            from sympflow.kernels.layered_splittings import LayeredCode
+
+            self._compile = partial(LayeredCode, system.layered)
         else:
             raise NotCompiled(
                 f"`system` cannot be compiled, for its functions could not be traced: {system.untraced}. Change them, "
@@ -324,14 +323,6 @@ class SplittingLoops:
         return own.with_constants(values if varied or self.takes_values(table.level) else ())
 
 
-def _layered_code(layered: LayeredPotential, level: int, compensated: bool, monomials: Monomials) -> Any:
-    if compensated:
-        raise NotCompiled("`compensated` sums are not compiled for weights that torch follows: leave it out.")
-    from sympflow.kernels.layered_splittings import LayeredCode
-
-    return LayeredCode(layered)
-
-
 class SplittingKernel(Kernel):
     """The compiled loops of one scheme on one system, a `Kernel`: see `SplittingLoops.kernel`.
 
@@ -401,7 +392,7 @@ class SplittingKernel(Kernel):
         if len(task.y0) % len(self._values):
             raise TypeError("`y0` must be a batch (N, 2d): trajectories have their own parameters.")
         latest = self._latest
-        if latest is None or len(latest) != len(task.y0) or not task.goes_on:
+        if latest is None or len(latest) != len(task.y0) or task.carry is None or task.carry.running is None:
             latest = self._latest = self._with_values(task.y0)
         return latest
 

@@ -10,7 +10,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import copy_context
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -22,7 +21,7 @@ from sympflow.kernels.runs import BLOCK, Memory, Room
 from sympflow.kernels.stages import evaluated
 from sympflow.kernels.threads import NEVER, threads_for
 
-__all__ = ["Member", "SharedMemory", "SharedRollouts", "Team", "meet"]
+__all__ = ["Member", "SharedMemory", "SharedRollouts", "meet"]
 
 ARRIVED, TURN = 0, 8
 """Places in `meeting` (16,), in lines of the cache of their own: threads that are here, and times that all were."""
@@ -32,34 +31,28 @@ MOMENT = 200_000_000  # about how many nanoseconds pass between two looks for an
 _I32 = Type("i32")
 
 
-class Team:
-    """So many threads; one, where threads cannot leave a core."""
+def together(threads: int, member: Callable[[int], None], stop: np.ndarray) -> None:
+    """``member(k)`` of each thread k at the same time; one that fails sets ``stop[0]``, which ends the others."""
+    if threads == 1:
+        member(0)
+        return
 
-    def __init__(self, threads: int) -> None:
-        self.threads = threads if os.name == "posix" else 1
+    def guarded(k: int) -> None:
+        try:
+            member(k)
+        except BaseException:
+            stop[0] = 1  # the others would wait for ever
+            raise
 
-    def __call__(self, member: Callable[[int], None], stop: np.ndarray) -> None:
-        """``member(k)`` of each thread k at the same time; one that fails sets ``stop[0]``, which ends the others."""
-        if self.threads == 1:
-            member(0)
-            return
-
-        def guarded(k: int) -> None:
-            try:
-                member(k)
-            except BaseException:
-                stop[0] = 1  # the others would wait for ever
-                raise
-
-        with ThreadPoolExecutor(self.threads - 1) as pool:
-            try:
-                others = [pool.submit(copy_context().run, guarded, k) for k in range(1, self.threads)]
-                guarded(0)
-                for other in others:
-                    other.result()
-            except BaseException:
-                stop[0] = 1
-                raise
+    with ThreadPoolExecutor(threads - 1) as pool:
+        try:
+            others = [pool.submit(copy_context().run, guarded, k) for k in range(1, threads)]
+            guarded(0)
+            for other in others:
+                other.result()
+        except BaseException:
+            stop[0] = 1
+            raise
 
 
 def meet(meeting: Value, members: Value, stop: Value) -> None:
@@ -91,13 +84,8 @@ def _waited(meeting: Value, members: Value, stop: Value) -> None:
         going.value = code.apply("eq", (seen(TURN), turn)) & stopped
 
 
-@dataclass(frozen=True)
-class Member:
-    """A thread in its team: room for three states, what stages read, and what is kept for the addresses in that."""
-
-    room: np.ndarray
-    context: np.ndarray
-    others: Any = ()
+Member = tuple[np.ndarray, np.ndarray, Any]
+"""A thread in its team: room for three states, what stages read, and what is kept for the addresses in that."""
 
 
 class SharedMemory(Memory, ABC):
@@ -157,16 +145,16 @@ class SharedRollouts(SplittingRollouts):
             stop = arguments[-1]
         elif name == "run":
             arguments = *arguments[:-1], stop
-        team = Team(threads_for(self.pieces, n_columns * self.work, None) if n_rows == 1 else 1)
+        threads = threads_for(self.pieces, n_columns * self.work, None) if n_rows == 1 and os.name == "posix" else 1
         function, meeting = self.function(name, width), np.zeros(16, dtype=np.int64)
         given = [address(x) if isinstance(x, np.ndarray) else x for x in arguments]
-        members = self.members(meeting, stop, team.threads, max(1, min(BLOCK, MOMENT // max(1, self.work))))
+        members = self.members(meeting, stop, threads, max(1, min(BLOCK, MOMENT // max(1, self.work))))
 
         def run(k: int) -> None:
-            own = members(k)
-            function(*given, len(own.room) // 3, self.n_out, address(own.room), address(own.context))
+            room, context, _kept = members(k)
+            function(*given, len(room) // 3, self.n_out, address(room), address(context))
 
-        team(run, stop)
+        together(threads, run, stop)
 
     def step_rows(
         self, table: np.ndarray, x: np.ndarray, h: np.ndarray, t: np.ndarray, y: np.ndarray, out: np.ndarray

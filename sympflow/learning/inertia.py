@@ -13,7 +13,7 @@ from sympflow.learning.parts import Linear, Part, Waves
 class Inertia(Part):
     """½ pᵀM(q)⁻¹p, M symmetric, its entries sums Σ_k θ_k f_k(q): linear in θ in Lagrange's equations."""
 
-    of = "y"
+    of, linear, inertial, terms = "y", False, True, True
 
     def __init__(self, functions: Waves, entries: np.ndarray | None = None, unit: np.ndarray | None = None) -> None:
         d = functions.waves.shape[1]
@@ -30,18 +30,6 @@ class Inertia(Part):
             there = functions.functions(unit[:, None])[:, 0]
             self._shift = np.where(self._pair == 0, there[entries[:, 0]], 0.0)
         self._double = np.array([1.0 if i == j else 2.0 for i, j in self.pairs])
-
-    @property
-    def linear(self) -> bool:
-        return False
-
-    @property
-    def inertial(self) -> bool:
-        return True
-
-    @property
-    def terms(self) -> bool:
-        return True
 
     def subset(self, kept: np.ndarray) -> Inertia:
         return Inertia(self.functions, self.entries[kept], self.unit)

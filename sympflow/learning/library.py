@@ -159,7 +159,7 @@ class Terms(Sum):
         self.of, self.library, self.n = of, library, len(library)
 
     @cached_property
-    def quadratic(self) -> bool:
+    def quadratic(self) -> bool:  # type: ignore[override]
         return all(term.quadratic for term in self.library.terms)
 
     @property

@@ -32,11 +32,10 @@ class Part(ABC):
 
     of: str
     n: int
-
-    @property
-    def quadratic(self) -> bool:
-        """True if it is known to be a quadratic form."""
-        return False
+    quadratic: bool = False  # True if it is known to be a quadratic form
+    linear: bool = True  # True if it is linear in θ
+    terms: bool | np.ndarray = False  # True if `subset` leaves terms out; or the numbers (n,) that it may leave out
+    inertial: bool = False  # True of a kinetic energy whose masses depend on q, linear in θ in Lagrange's form
 
     @abstractmethod
     def gradient(self, theta: np.ndarray, x: np.ndarray, slope: bool, by_parameters: bool) -> Linear:
@@ -63,24 +62,9 @@ class Part(ABC):
         """The part with some of its numbers (n,), where it is a sum of terms, one for each; else the part itself."""
         return self
 
-    @property
-    def linear(self) -> bool:
-        """True if it is linear in θ."""
-        return True
-
-    @property
-    def terms(self) -> bool | np.ndarray:
-        """True if `subset` leaves terms out; or the numbers (n,) that it may leave out."""
-        return False
-
     def at(self, t: np.ndarray) -> Part:
         """The function at times t (N,), one for each column."""
         return self
-
-    @property
-    def inertial(self) -> bool:
-        """True if it is a kinetic energy whose masses depend on q, and linear in θ in Lagrange's form."""
-        return False
 
     def momenta(self, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """p = ∂L/∂v and p' = ∂L/∂q at q and v (d, N) for θ = 0, and their derivatives by θ (2d, n, N)."""
@@ -98,9 +82,7 @@ class Part(ABC):
 class Sum(Part):
     """Σ_k θ_k f_k of functions that are given."""
 
-    @property
-    def terms(self) -> bool:
-        return True
+    terms = True
 
     @property
     @abstractmethod
@@ -146,10 +128,7 @@ class Polynomial(Sum):
     def __init__(self, of: str, exponents: Any, scales: Any) -> None:
         self.of, self.exponents, self.scales = of, np.asarray(exponents, dtype=int), np.asarray(scales, dtype=float)
         self.n = len(self.exponents)
-
-    @property
-    def quadratic(self) -> bool:
-        return bool((self.exponents.sum(axis=1) == 2).all())
+        self.quadratic = bool((self.exponents.sum(axis=1) == 2).all())
 
     @property
     def width(self) -> int:
@@ -231,11 +210,7 @@ class Fixed(Part):
     """A function that is known: a sum with numbers that are not learned."""
 
     def __init__(self, part: Sum, theta: np.ndarray) -> None:
-        self.of, self.n, self.part, self.theta = part.of, 0, part, theta
-
-    @property
-    def quadratic(self) -> bool:
-        return self.part.quadratic
+        self.of, self.n, self.part, self.theta, self.quadratic = part.of, 0, part, theta, part.quadratic
 
     def gradient(self, theta: np.ndarray, x: np.ndarray, slope: bool, by_parameters: bool) -> Linear:
         value, slopes, _ = self.part.gradient(self.theta, x, slope, False)
@@ -348,6 +323,8 @@ class Waves(Sum):
 class Network(Part):
     """Σ_k w_k tanh(a_k·z + b_k), neurons in one layer; z has x_i/s_i, of an angle its cosine and sine."""
 
+    linear = False
+
     def __init__(self, of: str, width: int, scales: Any, periods: np.ndarray | None = None) -> None:
         self.of, self.width, self.scales = of, width, np.asarray(scales, dtype=float)
         self.periods = np.full(len(self.scales), np.inf) if periods is None else periods
@@ -355,10 +332,6 @@ class Network(Part):
             (i, kind) for i, P in enumerate(self.periods) for kind in (("cos", "sin") if np.isfinite(P) else ("line",))
         ]
         self.n = width * (len(self.inputs) + 2)
-
-    @property
-    def linear(self) -> bool:
-        return False
 
     def start(self, rng: np.random.Generator) -> np.ndarray:
         a = rng.normal(size=(self.width, len(self.inputs)))
@@ -442,6 +415,7 @@ class Distances(Part):
     """Σ_k θ_k (r_k/s)^e_k, or log(r/s) where e is 0, of distances between bodies (n_bodies, dim) or from 0."""
 
     of = "q"
+    terms = True
 
     def __init__(self, bodies: np.ndarray, terms: Sequence[tuple[int, int | None, int]], scale: float) -> None:
         self.bodies, self.kinds, self.scale, self.n = bodies, list(terms), scale, len(terms)
@@ -452,10 +426,6 @@ class Distances(Part):
         n = len(bodies)
         lines = [*combinations(range(n), 2), *((a, None) for a in range(n) if central)]
         return cls(bodies, [(*line, e) for line in lines for e in powers], scale)
-
-    @property
-    def terms(self) -> bool:
-        return True
 
     def subset(self, kept: np.ndarray) -> Distances:
         return Distances(self.bodies, [kind for kind, keep in zip(self.kinds, kept, strict=True) if keep], self.scale)
@@ -539,7 +509,7 @@ class Drive(Part):
         self.n = 2 * base.n + 1 if base.n else 0
 
     @property
-    def terms(self) -> np.ndarray:
+    def terms(self) -> np.ndarray:  # type: ignore[override]
         return np.arange(self.n) < self.n - 1
 
     def subset(self, kept: np.ndarray) -> Part:

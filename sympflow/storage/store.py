@@ -30,6 +30,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from itertools import product
 from math import prod
+from operator import attrgetter
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -85,11 +86,6 @@ class Field:
         ends = zip(index, self.chunks, self.shape, strict=True)
         return tuple(slice(i * size, min((i + 1) * size, n)) for i, size, n in ends)
 
-    def resized(self, lengths: Mapping[str, int]) -> Field:
-        """Return the field with other lengths of some dimensions."""
-        shape = tuple(lengths.get(dim, n) for dim, n in zip(self.dims, self.shape, strict=True))
-        return replace(self, shape=shape)
-
     def metadata(self) -> dict[str, Any]:
         """Return the array as zarr describes it."""
         return {
@@ -115,10 +111,6 @@ class Field:
         if any(metadata.get(key, ".") != value for key, value in own_layout.items()):
             raise ValueError("an array is laid out otherwise than here")
         return known
-
-    def is_like(self, other: Field) -> bool:
-        """Return True if another field has the same dimensions, shape, dtype and chunks."""
-        return (self.dims, self.shape, self.dtype, self.chunks) == (other.dims, other.shape, other.dtype, other.chunks)
 
     @property
     def filled(self) -> float:
@@ -220,8 +212,9 @@ class Store:
 
     def check_made_of(self, fields: Mapping[str, Field]) -> None:
         """Check that the arrays are those of the call that opens the store."""
+        alike = attrgetter("dims", "shape", "dtype", "chunks")
         for name in {**fields, **self.fields}:
-            if name in self.fields and not (name in fields and fields[name].is_like(self.fields[name])):
+            if name in self.fields and not (name in fields and alike(fields[name]) == alike(self.fields[name])):
                 raise self.damaged(f"its array {name!r} is not one that the call makes")
             if name not in self.fields or not (self.path / name).is_dir():
                 raise self.damaged(f"its array {name!r} is missing")
@@ -294,7 +287,10 @@ class Store:
         state: Mapping[str, np.ndarray] | None = None,
     ) -> None:
         """Set the lengths of dimensions, attributes, and the state to go on from, all at once or not at all."""
-        fields = {name: known.resized(lengths or {}) for name, known in self.fields.items()}
+        fields, lengths = dict(self.fields), lengths or {}
+        for name, known in fields.items():
+            shape = tuple(lengths.get(dim, n) for dim, n in zip(known.dims, known.shape, strict=True))
+            fields[name] = replace(known, shape=shape)
         changed = self.attributes | dict(attributes or {})
         before = self.attributes.get(KEPT)
         with _told(self.path):
@@ -395,14 +391,11 @@ class Appender:
         """Write full chunks, and keep what is left."""
         first = (self.length - self.held) // self.size
         for name, axis in self.axes.items():
-            tail = np.concatenate(self.tails[name], axis=axis)
-            for k in range(n_chunks):
-                part = [slice(None)] * tail.ndim
-                part[axis] = slice(k * self.size, (k + 1) * self.size)
-                self.store.write(name, self._index(name, first + k), tail[tuple(part)])
-            part = [slice(None)] * tail.ndim
-            part[axis] = slice(n_chunks * self.size, None)
-            self.tails[name] = [tail[tuple(part)].copy()]
+            ends = range(self.size, n_chunks * self.size + 1, self.size)
+            *full, rest = np.split(np.concatenate(self.tails[name], axis=axis), ends, axis=axis)
+            for k, part in enumerate(full):
+                self.store.write(name, self._index(name, first + k), part)
+            self.tails[name] = [rest.copy()]
         self.held -= n_chunks * self.size
 
     def commit(
@@ -435,18 +428,14 @@ def read_arrays(file: Path, most: int) -> dict[str, np.ndarray]:
             if member.compress_type != zipfile.ZIP_STORED:
                 raise ValueError(f"{member.filename} is packed")
             content = io.BytesIO(archive.read(member))
-            shape, _, dtype = _npy_header(content)
+            if np.lib.format.read_magic(content) != (1, 0):
+                raise ValueError("an array of another format")
+            shape, _, dtype = np.lib.format.read_array_header_1_0(content)
             if prod(shape) * dtype.itemsize != member.file_size - content.tell():
                 raise ValueError(f"{member.filename} has another length")
             content.seek(0)
             arrays[member.filename.removesuffix(".npy")] = np.load(content, allow_pickle=False)
     return arrays
-
-
-def _npy_header(content: Any) -> tuple[tuple[int, ...], bool, np.dtype]:
-    if np.lib.format.read_magic(content) != (1, 0):
-        raise ValueError("an array of another format")
-    return np.lib.format.read_array_header_1_0(content)
 
 
 def difference(theirs: Mapping[str, str], mine: Mapping[str, str]) -> str:

@@ -6,14 +6,13 @@ import math
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sympflow.arguments import check_one_of
 from sympflow.arrays import to_numpy
 from sympflow.hamiltonian.scales import smallest_size
-from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.registry import build
 from sympflow.metrics.crossings import Plane, crossings, stroboscopic, whole_periods
 from sympflow.show.style import TEXT, dress, filled, frame, labelled, legend_above, method_styles, new_figure, save
@@ -40,24 +39,7 @@ SMALLEST, LARGEST = 1e-15, 1e3  # errors shown in figures of stability
 UNSTABLE = "#5A1020"
 _GREEK = {"omega": "ω"}
 
-
-class Compared(Protocol):
-    """The part of a comparison that is drawn."""
-
-    @property
-    def system(self) -> HamiltonianSystem: ...
-    @property
-    def title(self) -> str: ...
-    @property
-    def t_span(self) -> tuple[float, float]: ...
-    @property
-    def y0(self) -> np.ndarray: ...
-    @property
-    def t(self) -> np.ndarray: ...
-    @property
-    def metrics(self) -> tuple[str, ...]: ...
-    @property
-    def runs(self) -> tuple[Attempt, ...]: ...
+Compared = Any  # a `Comparison`, whose module imports this one
 
 
 # comparisons ----------------------------------------------------------------------------------------------------------
@@ -125,8 +107,7 @@ def _error_panel(ax: Axes, comparison: Compared, styles: dict[str, tuple[str, st
         error = max(row.error or 0.0, ROUNDING_FLOOR)
         ax.errorbar(row.run_time or 0.0, error, xerr=spread, color=colour, lw=1, capsize=0, zorder=2)
         ax.plot(row.run_time or 0.0, error, marker, color=colour, ms=8, mec="white", mew=0.8, zorder=3)
-    ax.set_xscale("log")
-    ax.set_yscale("log")
+    ax.set(xscale="log", yscale="log")
     if shown:
         _widen(ax.set_xlim, [row.run_time or 0.0 for row in shown])
         _widen(ax.set_ylim, [max(row.error or 0.0, ROUNDING_FLOOR) for row in shown], share=0.16)
@@ -350,8 +331,7 @@ def precision_figure(rows: Sequence[Row], heading: str, measure: str = "energy_e
             for label, _ in labels:
                 points = [row for row in rows if row.label == label and row.trajectories == size]
                 _precision_curve(ax, points, cost, measure, styles[label])
-            ax.set_xscale("log")
-            ax.set_yscale("log")
+            ax.set(xscale="log", yscale="log")
             dress(ax, MEASURES[measure], COSTS[cost])
             ax.invert_xaxis()
         many = "one trajectory" if size == 1 else f"batch of {size:,}"
@@ -397,8 +377,7 @@ def step_errors(all_rows: Sequence[Row]) -> Figure:
             own = [r for r in rows if (r.label, r.dtype) == (label, dtype)]
             _stability_curve(ax, own, styles[label], "" if dtype == "float64" else f" ({dtype})")
         ax.set_ylim(SMALLEST / 3, 3 * LARGEST)  # before the scale, which warns where all errors are the same
-        ax.set_xscale("log")
-        ax.set_yscale("log")
+        ax.set(xscale="log", yscale="log")
         _plain_ticks(ax.xaxis, [r.dt for r in rows if r.dt is not None])
         dress(ax, "step", "largest |energy error|, relative")
         ax.set_title(filled(name, 5.0, 10), loc="left", fontsize=10, color=TEXT)
@@ -456,8 +435,7 @@ def stability_map(
         ax.scatter(x[bad], y[bad], c=UNSTABLE, marker="x", s=22, lw=1.0)
         if line := limits.get(label):
             ax.plot(*zip(*line, strict=True), color="#D55E00", lw=1.4, marker="o" if len(line) == 1 else "", ms=4)
-        ax.set_xscale("log")
-        ax.set_yscale("log")
+        ax.set(xscale="log", yscale="log")
         _plain_ticks(ax.xaxis, [r.dt for r in all_rows if r.dt is not None])
         _plain_ticks(ax.yaxis, [r.value for r in all_rows if r.value is not None])
         parameter = next((r.parameter for r in rows if r.parameter), "parameter")

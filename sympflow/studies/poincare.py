@@ -276,9 +276,7 @@ class PoincareSection(Report):
     @cached_property
     def rows(self) -> tuple[Any, ...]:
         """One for each crossing: trajectory, t, and the coordinates q1 … pd."""
-        d = self.system.ndof
-        columns = [("trajectory", int), ("t", float), *((name, float) for name in names(d))]
-        Crossing = make_dataclass("Crossing", columns, frozen=True)
+        Crossing = make_dataclass("Crossing", self.columns, frozen=True)
         return tuple(
             Crossing(int(k), float(t), *map(float, y))
             for k, t, y in zip(self.trajectory, self.t, self.states, strict=True)

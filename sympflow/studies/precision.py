@@ -126,16 +126,10 @@ def work_precision(
     references: list[Reference | None] = []
     for start in starts:
         conditions = Conditions(system, (t0, t1), start, t, backend)
-        say = partial(_prefixed, progress, f"{system.name}, {conditions.trajectories} trajectories")
-        measured, truth = _measure(conditions, swept, repeats, budget, say)
+        measured, truth = _measure(conditions, swept, repeats, budget, progress or (lambda text: None))
         rows += break_even(measured, abs(t1 - t0), conditions.measure)
         references.append(truth)
     return WorkPrecision(system, (t0, t1), n_outputs, repeats, tuple(references), tuple(rows))
-
-
-def _prefixed(progress: Callable[[str], None] | None, scene: str, text: str) -> None:
-    if progress is not None:
-        progress(f"{scene}: {text}")
 
 
 def _batch(system: HamiltonianSystem, batch: int | ArrayLike) -> np.ndarray:
@@ -211,7 +205,8 @@ def _measure(
     say: Callable[[str], None],
 ) -> tuple[list[Row], Reference | None]:
     """All points for one set of initial states."""
-    say("reference")
+    scene = f"{conditions.system.name}, {conditions.trajectories} trajectories"
+    say(f"{scene}: reference")
     truth, problem = None, ""
     try:
         truth = compute_reference(conditions.system, conditions.t_span, conditions.y0, conditions.t)
@@ -221,7 +216,7 @@ def _measure(
     floor = FLOOR if conditions.measure in _KEPT else max(FLOOR, resolved)
     points: list[Attempt] = []
     for candidate, integrators in swept:
-        say(candidate.label)
+        say(f"{scene}: {candidate.label}")
         error = math.inf
         last = Attempt(replace(candidate, integrator=integrators[-1]), Row("", "", ""))
         last.warm_up(conditions.run, conditions.t, conditions.t_span[0], conditions.system.dt)
@@ -236,7 +231,7 @@ def _measure(
             error = _figure(point.row, conditions.measure)
             if point.row.status == "not applicable" or (error < floor and before < max(NEAR_FLOOR, 1e3 * floor)):
                 break
-    say("timing")
+    say(f"{scene}: timing")
     again = [p for p in points if p.row.status == "ok" and (p.row.run_time or 0.0) * repeats <= budget]
     times = interleaved([partial(conditions.run, p.candidate.integrator) for p in again], repeats)
     for point, run_time in zip(again, times, strict=True):

@@ -159,7 +159,7 @@ def test_widths_change_nothing(monkeypatch):
     system, runs = chain(48), []
     for width in (1, 2, 4, 8):
         monkeypatch.setattr(lattices, "arrangement", lambda lattice, width=width: ([0], width))
-        code = lattices.LatticeCode(system.local, SCHEMES["chin4c"].level, False, False)
+        code = lattices.LatticeCode(system.local, False, SCHEMES["chin4c"].level, False)
         runs.append(np.empty((1, 96)))
         code.mapped(single_table(SCHEMES["chin4c"], 0.1).packed, start(system, 1), runs[-1])
         np.testing.assert_array_equal(runs[-1], runs[0])
