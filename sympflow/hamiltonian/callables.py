@@ -69,6 +69,9 @@ class CallableHamiltonian(Definition):
             raise TypeError("`gradient` and `hessian_vector` only go with `potential`: leave them out.")
         self.ndof, self.given, self.timed = ndof, bool(check), timed
         self.separable = potential is not None
+        self._name = "potential" if self.separable else "hamiltonian"
+        self._given_function: Any = potential if self.separable else hamiltonian
+        self._some_time = (0.0,) * timed
         self._functions = functions
         if _is_numba(gradient):
             _check_numba(potential, gradient, hessian_vector, "t, " * timed)
@@ -77,13 +80,10 @@ class CallableHamiltonian(Definition):
             functions = V, None, slope, None if hessian_vector is None else product
         of_arrays = [None if f is None else _OverTimes(f) if timed else f for f in functions]
         self._potential, self._hamiltonian, self._gradient, self._hessian_vector = of_arrays
+        self.given_functions = self.numba_functions is None
 
     def identity_parts(self) -> Any:
         return [self.ndof, self._functions] if self.timed else [self.ndof, *self._functions]
-
-    @property
-    def given_functions(self) -> bool:  # type: ignore[override]
-        return self.numba_functions is None
 
     def place(self, y0: Any, domain: Any, inverse_mass: np.ndarray | None, t_span: tuple[float, float]) -> None:
         self._scene = y0, domain, inverse_mass, t_span
@@ -154,15 +154,6 @@ class CallableHamiltonian(Definition):
     def differentiates_itself(self) -> bool:  # type: ignore[override]
         *_, gradient, product = self._functions
         return gradient is None and product is None and not self.has_third_derivative
-
-    @property
-    def _name(self) -> str:
-        return "potential" if self.separable else "hamiltonian"
-
-    @property
-    def _given_function(self) -> Callable[..., Any]:
-        V, H, *_ = self._functions
-        return V if self.separable else H
 
     def _traced(self) -> TracedHamiltonian:
         """The program, compared with the functions."""
@@ -302,10 +293,6 @@ class CallableHamiltonian(Definition):
     @property
     def _reason(self) -> tuple[str, bool]:
         return self.untraced, self.library == "numpy"
-
-    @property
-    def _some_time(self) -> tuple[float, ...]:
-        return (0.0,) * self.timed
 
     def check(self, states: np.ndarray, like: Array, n_given: int, times: Sequence[float] = ()) -> None:
         """Test them against each other at states (n, 2d) in the library and dtype of `like`: see `function_checks`."""

@@ -28,6 +28,7 @@ class Samples:
 
     def __init__(self, c: np.ndarray, x: np.ndarray, periodic: bool) -> None:
         self.c, self.x, self.periodic = c, x, periodic
+        self.span = float(x[0]), float(x[-1])  # the first and the last time
         for each in (c, x):
             each.setflags(write=False)
 
@@ -57,11 +58,6 @@ class Samples:
                 f"`params` has {name}, a spline that is not finite: give finite samples at two times at least."
             )
         return cls(np.ascontiguousarray(c[:, kept]), ends, spline.extrapolate == "periodic")
-
-    @property
-    def span(self) -> tuple[float, float]:
-        """The first and the last time of the samples."""
-        return float(self.x[0]), float(self.x[-1])
 
     @cached_property
     def jumps(self) -> np.ndarray:

@@ -27,6 +27,7 @@ class LayeredPotential:
         self.first = chain.first
         self.sizes = [(w.shape[1], w.shape[0]) for w, _ in chain.layers]
         self.tensors = [x for pair in chain.layers for x in pair if x is not None]
+        self.n_weights = sum(x.numel() for x in self.tensors)
         if sum(map(sum, self.sizes)) > MOST_FEATURES or self.sizes[-1][1] > MOST_OUTPUTS:
             raise Untraceable(f"its layers have more than {MOST_FEATURES} features, or {MOST_OUTPUTS} at the end")
 
@@ -46,11 +47,6 @@ class LayeredPotential:
             found.append((n, None if bias is None else n + come * go))
             n += (come + (bias is not None)) * go
         return found
-
-    @cached_property
-    def n_weights(self) -> int:
-        """Count of the numbers in the tensors."""
-        return sum(x.numel() for x in self.tensors)
 
     @property
     def weights(self) -> np.ndarray:

@@ -87,21 +87,13 @@ class Frame:
             [np.broadcast_to(heavy, self.order.shape), np.broadcast_to(light, self.test.shape)]
         )
         self.periods = 2 * np.pi * np.sqrt(self.size**3 / (G * (masses[0] + masses[1:])))
-
-    @property
-    def longest_step(self) -> float:
-        """The longest time between two kicks."""
-        return float(self.periods.min()) / FEWEST_STEPS
-
-    @cached_property
-    def bodies(self) -> np.ndarray:
-        """The bodies in the order of the coordinates."""
-        return np.concatenate([self.order, self.test])
-
-    @cached_property
-    def weights(self) -> list[float]:
-        """The share of each planet in the mass of all up to it."""
-        return (self.masses[self.order] / self.sums[1:]).tolist()
+        self.longest_step = float(self.periods.min()) / FEWEST_STEPS  # between two kicks
+        self.bodies = np.concatenate([self.order, self.test])  # in the order of the coordinates
+        self._places = np.argsort(np.concatenate([[0], self.bodies]))
+        self.weights = (masses[self.order] / self.sums[1:]).tolist()  # of each planet in the mass of all up to it
+        one, other = (self.order[i] for i in np.triu_indices(len(self.order), 1))
+        self.pairs = one, other  # of planets that have a mass
+        self.limits = ((encounter or 0.0) * self.hill_radii(one, other)) ** 2  # of squared distances, which end a run
 
     def hill_radii(self, i: Any, j: Any, share: float = 1.0) -> np.ndarray:
         """The mutual Hill radius of bodies; with a share of 0 that of i and bodies without mass."""
@@ -140,10 +132,6 @@ class Frame:
         if len(self.test):
             bodies = concatenate([bodies, x[..., n:, :] + stack(centres, axis=-2)[..., self.inside, :]], -2)
         return (bodies + (centre - R)[..., None, :])[..., self._places, :]
-
-    @cached_property
-    def _places(self) -> np.ndarray:
-        return np.argsort(np.concatenate([[0], self.bodies]))
 
     def into(self, y: Array) -> tuple[Array, Array, Array, Array]:
         """x and v of the planets (..., n − 1, 3), and the place and velocity of the centre (..., 3), of states."""
@@ -251,17 +239,6 @@ class Frame:
         i, j = self.pairs
         d = q[..., i, :] - q[..., j, :]
         return (d * d).sum(-1) < like(self.limits, d)
-
-    @cached_property
-    def pairs(self) -> tuple[np.ndarray, np.ndarray]:
-        """The pairs of planets that have a mass."""
-        i, j = np.triu_indices(len(self.order), 1)
-        return self.order[i], self.order[j]
-
-    @cached_property
-    def limits(self) -> np.ndarray:
-        """The square of the distance of each pair that ends a run."""
-        return ((self.encounter or 0.0) * self.hill_radii(*self.pairs)) ** 2
 
     def check(self, method: str) -> None:
         """Raise a ValueError where some body is no planet of the star: bound to another one, or not bound at all."""

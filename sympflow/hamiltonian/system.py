@@ -686,6 +686,7 @@ class HamiltonianSystem(Hamiltonian, Answering):
         """Make the system of a definition, in a scene."""
         Hamiltonian.__init__(self, scene.name, definition, inverse_mass, quadratic_kinetic)
         self.stiffness_matrix = stiffness_matrix
+        self._arguments = self.ndof if self.separable else 2 * self.ndof  # components of a state that functions take
         if stiffness_matrix is not None:
             stiffness_matrix.setflags(write=False)
         self.friction = Friction(checked_damping(damping, self.ndof))
@@ -884,11 +885,6 @@ class HamiltonianSystem(Hamiltonian, Answering):
         """The times at which functions of the system are tried: the first one, of a driven system others after it."""
         t0, t1 = self.t_span
         return [t0] if self.autonomous else probe_times(t0, t1 if length is None else t0 + length).tolist()
-
-    @property
-    def _arguments(self) -> int:
-        """The number of components of a state that the given functions depend on: V is one of q alone."""
-        return self.ndof if self.separable else 2 * self.ndof
 
     def kicks(self, t0: float, t1: float) -> list[Kick]:
         """Return the impulses of H between two times, in their order; each has its time `t`, and maps states.
