@@ -68,6 +68,8 @@ class Hamiltonian:
         self.name = name
         self.definition = definition
         self.symbols: Any = definition.symbols
+        self.local: LocalHamiltonian | None = definition if definition.loops else None
+        """The definition by one piece, of a lattice or of pairs, with what it has of its own, such as `shape`."""
         self.ndof: int = definition.ndof
         self.separable: bool = definition.separable
         self.inverse_mass = inverse_mass
@@ -445,11 +447,6 @@ class Hamiltonian:
                 f"not apply. Use {self.definition.instead}."
             )
         return self
-
-    @property
-    def local(self) -> LocalHamiltonian | None:
-        """The definition by one piece, of a lattice or of pairs, with what it has of its own, such as `shape`."""
-        return self.definition if self.definition.loops else None
 
     @property
     def form(self) -> SymbolicHamiltonian | TracedHamiltonian | None:

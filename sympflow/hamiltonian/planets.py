@@ -308,6 +308,11 @@ class PlanetsHamiltonian(PairsHamiltonian):
         if encounter is not None and not (real_number(encounter) and 0 < encounter < math.inf):
             raise ValueError(f"`encounter` must be positive, in Hill radii, or None for none; got {encounter!r}.")
         super().__init__("-G*m1*m2/r", masses, 3, None, None, None, {"G": G}, None)
+        self.felt = None if (self.masses > 0).all() else np.repeat(np.where(self.masses > 0, 1.0, 0.0), 3)
+        self.is_few = self.is_few and self.felt is None and extra is None
+        self._all_at_once = self._all_at_once and self.felt is None
+        self._programs: dict[int, Program] = {}
+        self.in_terms = extra is not None
         self.start, self.coordinates, self.encounter = y0, coordinates, encounter
         self.columns = self.inertia[None]  # what bodies without mass feel is per unit mass
         self._take_extra(extra, params)
@@ -369,10 +374,6 @@ class PlanetsHamiltonian(PairsHamiltonian):
                 raise ValueError(f"`extra` cannot be differentiated: {error} Write it with other functions.") from error
         return self._programs[order]
 
-    @cached_property
-    def _programs(self) -> dict[int, Program]:
-        return {}
-
     def _of_extra(self, order: int, *arrays: Array) -> Array:
         """The numbers (..., n − 1, 1 or 3) that its program gives of arrays (..., d), per unit mass of a body."""
         q, *vectors = (self._of_bodies(a) for a in arrays)
@@ -398,28 +399,12 @@ class PlanetsHamiltonian(PairsHamiltonian):
         """Do nothing: bodies may have no mass."""
 
     @property
-    def inertia(self) -> np.ndarray:
-        return np.where(self.masses > 0, self.masses, 1.0)
-
-    @cached_property
-    def felt(self) -> np.ndarray | None:  # type: ignore[override]
-        return None if (self.masses > 0).all() else np.repeat(np.where(self.masses > 0, 1.0, 0.0), 3)
-
-    @property
     def arrays_only(self) -> str:  # type: ignore[override]
         """The reason why methods of other splittings have no compiled kicks; "" if they have."""
         if self.felt is not None:
             return "bodies without mass"
         few = self.ndof <= MOST_SPELLED and self.n_bodies * (self.n_bodies - 1) // 2 <= MOST_SPELLED_PAIRS
         return "" if self.extra is None or few else "an `extra` potential of many bodies"
-
-    @property
-    def in_terms(self) -> bool:  # type: ignore[override]
-        return self.extra is not None
-
-    @property
-    def is_few(self) -> bool:
-        return self.felt is None and self.extra is None and super().is_few
 
     def written_potential(
         self, q: Sequence[Any], softening: Any, columns: Sequence[Any], c: Mapping[Any, Any], box: Sequence[Any] = ()
@@ -434,10 +419,6 @@ class PlanetsHamiltonian(PairsHamiltonian):
             put = dict(zip(self._places, (*x, sp.sqrt(sp.Add(*(y**2 for y in x)))), strict=True))
             V += columns[0][i] * self.extra.xreplace({**own, **put})
         return V
-
-    @property
-    def _all_at_once(self) -> bool:
-        return self.felt is None and super()._all_at_once
 
     def _ends(self, bodies: Sequence[Array]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         if self.felt is None:
