@@ -273,6 +273,54 @@ def test_a_tolerance_below_single_precision_is_refused():
         sympflow.solve(sympflow.systems.henon_heiles(), "kahan_li8", (0, 10), tol=1e-9, dtype="float32")
 
 
+KEPLER = "(p1**2 + p2**2)/2 - 1/sqrt(q1**2 + q2**2)", [0.1, 0, 0, 4.3588989435406735]
+
+
+@pytest.mark.parametrize(
+    ("method", "options", "told"),
+    [
+        ("log_leapfrog", {"dt": 20.0}, "`dt` 20 is too long for method 'log_leapfrog': with half of it the run ends"),
+        ("log_kahan_li8", {"dt": 5.0}, "`dt` 5 is too long for method 'log_kahan_li8': with half of it the run ends"),
+        ("log_blanes_moan4", {"dt": 20.0}, "`dt` 20 is too long for method 'log_blanes_moan4': the energy"),
+        ("rk45", {}, "`rtol` is too large for method 'rk45': the energy of the run is off by .* Take rtol=1e-8"),
+        ("dop853", {}, "`rtol` is too large for method 'dop853': the energy of the run is off by"),
+    ],
+)
+def test_every_method_whose_steps_are_too_long_is_doubted(method, options, told):
+    H0, y0 = KEPLER if method != "dop853" else ("p**2/2 + q**2/2", [1, 0])
+    end = 20 if options else 100 if method == "rk45" else 2000
+    with pytest.warns(RuntimeWarning, match=told):
+        solve(H(H0, y0=y0), method, (0, end), **options)
+    fine = {"rtol": 1e-8, "atol": 1e-10} if not options else {"dt": 0.05}
+    solve(H(H0, y0=y0), method, (0, 20), **fine)  # in silence
+
+
+@pytest.mark.parametrize(
+    "run",
+    [
+        lambda system, y0: sympflow.ensemble(system, "verlet", (0, 100), y0=y0, dt=0.55, reduce="energy_error"),
+        lambda system, y0: sympflow.ensemble(system, "rk45", (0, 100), y0=y0, t_eval=[100.0], rtol=0.1, atol=0.1),
+        lambda system, y0: sympflow.lyapunov(system, "verlet", (0, 100), y0, dt=0.55),
+        lambda system, y0: sympflow.sali(system, "verlet", (0, 100), y0, dt=0.55),
+        lambda system, y0: sympflow.poincare_section(system, "verlet", (0, 100), y0, coordinate="p", dt=0.55),
+        lambda system, y0: sympflow.escape_times(system, "verlet", (0, 100), y0, outside=5.0, dt=0.55),
+        lambda system, y0: sympflow.frequencies(system, "verlet", (0, 100), y0, dt=0.55),
+        lambda system, y0: solve(system, "verlet", (0, 100), y0, params={"k": [1.0, 1.1]}, dt=0.55),
+    ],
+)
+def test_orbits_of_which_no_states_are_kept_are_doubted_too(run):
+    system = H("p**2/2 + k*(q**2 - 1)**2/4", y0=[1.5, 0], params={"k": 1.0})
+    with pytest.warns(RuntimeWarning, match=r"is too l.* for method .*: the energy of the run is off by"):
+        run(system, np.array([[1.5, 0.0], [1.6, 0.0]]))
+
+
+def test_orbits_that_leap_over_a_wall_by_the_default_step_are_told():
+    system = H("p**2/2 + 4*(q**-12 - q**-6)", y0=[50, -10])
+    with pytest.warns(RuntimeWarning, match=r"`system`: .* passed q1 = 0, where H is infinite"):
+        sympflow.ensemble(system, "verlet", (0, 20), y0=[[50, -10], [40, -8]])
+    assert solve(system, "verlet", (0, 20)).status == -1
+
+
 @pytest.mark.parametrize("dt", [0.5, 3.0, 100.0])
 def test_a_run_of_few_steps_that_are_far_too_long_is_told(dt):
     system = H("p**2/2 + q**2/2 + 0.3*q**4", y0=[1, 0])

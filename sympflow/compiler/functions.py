@@ -200,15 +200,31 @@ FUNCTIONS: dict[str, Function] = {
     "iv": Function(_special("iv"), _no_tensors("iv"), _by_last("iv", _bessel("iv", 1.0, 1.0)), 300),
     "kv": Function(_special("kv"), _no_tensors("kv"), _by_last("kv", _bessel("kv", -1.0, -1.0)), 300),
     "ellipk": Function(_special("ellipk"), _no_tensors("ellipk"), lambda y, m: (
-        (apply("ellipe", m) - (1.0 - m) * y) / (2.0 * m * (1.0 - m)),), 200),
+        math.pi / 8.0 * apply("hyp2f1", 1.5, 1.5, 2.0, m),), 200),
     "ellipe": Function(_special("ellipe"), _no_tensors("ellipe"), lambda y, m: (
-        (y - apply("ellipk", m)) / (2.0 * m),), 200),
+        -math.pi / 8.0 * apply("hyp2f1", 0.5, 1.5, 2.0, m),), 200),
+    "hyp2f1": Function(_special("hyp2f1"), _no_tensors("hyp2f1"), lambda y, a, b, c, x: (
+        0.0, 0.0, 0.0, a * b / c * apply("hyp2f1", a + 1.0, b + 1.0, c + 1.0, x)), 300),
     "expi": Function(_special("expi"), _no_tensors("expi"), lambda y, x: (apply("exp", x) / x,), 200),
     "exp1": Function(_special("exp1"), _no_tensors("exp1"), lambda y, x: (-(apply("exp", -x) / x),), 200),
     "dawsn": Function(_special("dawsn"), _no_tensors("dawsn"), lambda y, x: (1.0 - 2.0 * x * y,), 200),
 }
 # fmt: on
-OF_SCIPY = ("gamma", "gammainc", "gammaincc", "jv", "yv", "iv", "kv", "ellipk", "ellipe", "expi", "exp1", "dawsn")
+OF_SCIPY = (
+    "gamma",
+    "gammainc",
+    "gammaincc",
+    "jv",
+    "yv",
+    "iv",
+    "kv",
+    "ellipk",
+    "ellipe",
+    "hyp2f1",
+    "expi",
+    "exp1",
+    "dawsn",
+)
 """Functions of `scipy.special` that compiled code calls, at their addresses."""
 SPECIAL = "scipy_special_"  # with which their names in code begin
 

@@ -23,6 +23,7 @@ from sympflow.ensembles.results import Block, Done, Ensemble, Keeper, Layout, Me
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.choosing import integrator_for, with_start
 from sympflow.integrators.contract import Integrator, Problem
+from sympflow.integrators.diagnosis import try_steps
 from sympflow.integrators.problems import check_backend, check_own_parameters
 from sympflow.integrators.provenance import provenance
 from sympflow.integrators.registry import check_applies
@@ -175,6 +176,8 @@ def ensemble(
     pieces = blocks(layout.shape, sizes)
     left = [piece for piece in pieces if not keeper.is_done(piece)]
     report(sum(piece.size for piece in pieces) - sum(piece.size for piece in left))
+    if left:
+        try_steps(integrator, problem.system, problem.t_span, first)
     if left and workers != 1:  # what is compiled here is loaded by workers on this machine
         task.prepare(first)
     items = ((piece, orbits.sent(*piece.ranges[-1])) for piece in left)

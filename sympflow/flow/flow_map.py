@@ -319,10 +319,6 @@ class FlowMap(KnownFlow, Shown, nn.Module):
         """Return compiled derivatives of ψ̄_t and d/dt ψ̄_t by the parameters, for Gauss–Newton; None if it has none."""
         return None
 
-    def step_constants(self, x: Tensor, *t0: Tensor) -> Tensor:
-        """The constants of a step from states (N, 2d) that its networks take beside these and t: (m, N)."""
-        return x.new_empty(0, len(x))
-
     # its numbers -------------------------------------------------------------------------------------------
 
     def _number(self) -> Tensor:

@@ -568,6 +568,7 @@ class SympFlow(FlowMap):
         return NetworkTangents(self.ndof, [layer.kind == "kick" for layer in self.layers], networks)
 
     def step_constants(self, x: Tensor, *t0: Tensor) -> Tensor:
+        """The constants of a step from states (N, 2d) that its networks take beside these and t: (m, N)."""
         return self._opened(self._columns(0.0, self.lift(x, *t0))[1], 0.0)[0][self.ndof :]
 
     def hamiltonian_unchecked(self, t: float | Tensor, x: Tensor, t0: Any = None) -> Tensor:

@@ -138,8 +138,8 @@ class CallableHamiltonian(Definition):
     def may_jump(self) -> bool:  # type: ignore[override]
         return self._jumping.may_jump
 
-    def jump_times(self, low: float, high: float, step: float) -> np.ndarray:
-        return self._jumping.jump_times(low, high, step)
+    def jump_times(self, low: float, high: float, step: float, kinks: bool = False) -> np.ndarray:
+        return self._jumping.jump_times(low, high, step, kinks)
 
     @property
     def has_hessian_vector(self) -> bool:  # type: ignore[override]

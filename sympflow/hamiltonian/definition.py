@@ -60,8 +60,8 @@ class Definition:
     def __getstate__(self) -> dict[str, Any]:
         return {name: value for name, value in vars(self).items() if name not in self._generated}
 
-    def jump_times(self, low: float, high: float, step: float) -> np.ndarray:
-        """The times (n,) between two others at which H is known to jump; `step` as of `Hamiltonian.jump_times`."""
+    def jump_times(self, low: float, high: float, step: float, kinks: bool = False) -> np.ndarray:
+        """The times (n,) between two others at which H is known to jump; the rest as of `Hamiltonian.jump_times`."""
         return np.zeros(0)
 
     @property

@@ -17,7 +17,7 @@ from typing import Any
 
 import sympy as sp
 
-from sympflow.hamiltonian.removable import Max, Min, with_own_functions
+from sympflow.hamiltonian.removable import BOUNDED, Max, Min, with_own_functions
 
 MAX_TEXT = 100_000  # characters
 MAX_NESTING = 100  # brackets and powers in each other
@@ -43,6 +43,7 @@ FUNCTIONS: dict[str, Callable[..., Any]] = {
     **{name: getattr(sp, name) for name in (*ELEMENTARY, *SPECIAL, "Abs", "Rational", "DiracDelta")},
     **{"Max": Max, "Min": Min, "max": Max, "min": Min, "floor": sp.floor, "ceiling": sp.ceiling, "Mod": sp.Mod},
     "frac": sp.frac,
+    **BOUNDED,
     "ln": sp.log,
     "log10": lambda x: sp.log(x) / sp.log(10),
     "log2": lambda x: sp.log(x) / sp.log(2),

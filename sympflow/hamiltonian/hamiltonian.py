@@ -247,14 +247,14 @@ class Hamiltonian:
         """
         return self.definition.shortest_piece
 
-    def jump_times(self, low: float, high: float, step: float) -> np.ndarray:
-        """The times (n,) between two others at which H jumps: of samples, and of functions of t that jump.
+    def jump_times(self, low: float, high: float, step: float, kinks: bool = False) -> np.ndarray:
+        """The times (n,) between two others at which H jumps, or has `kinks`: of samples, and of functions of t.
 
         Functions that jump are `Heaviside`, `sign`, `floor`, `acot`, `atan2`, an absolute value in a quotient, the
         conditions of pieces, and similar ones. Zeros of arguments that are neither linear nor periodic are resolved to
         `step`. In a long interval with many jumps only the first ones are returned.
         """
-        return self.definition.jump_times(low, high, step)
+        return self.definition.jump_times(low, high, step, kinks)
 
     @cached_property
     def between_impulses(self) -> Self:

@@ -19,6 +19,7 @@ import sympy as sp
 from sympy.core.relational import Relational
 
 from sympflow.hamiltonian.driving import JUMP, MOST_TURNS, Samples, sampled, with_symbols
+from sympflow.hamiltonian.removable import triangle
 
 MISMATCH = 1e-6
 """Share of the values on both sides of a border by which pieces that are joined may differ there: their constants are
@@ -46,7 +47,7 @@ class Border:
         return set().union(self.g.free_symbols, *(f.free_symbols for f in (*self.above, *self.below)))
 
 
-_STEPS = (sp.Heaviside, sp.sign, sp.Abs, sp.acot, sp.atan2, sp.floor)
+_STEPS = (sp.Heaviside, sp.sign, sp.Abs, sp.acot, sp.atan2, sp.floor, sp.Max, sp.Min, triangle)
 
 
 def borders(f: sp.Expr, symbols: Iterable[sp.Symbol]) -> list[Border]:
@@ -56,7 +57,9 @@ def borders(f: sp.Expr, symbols: Iterable[sp.Symbol]) -> list[Border]:
         f = f.replace(sp.frac, lambda x: x - sp.floor(x)).replace(sp.ceiling, lambda x: -sp.floor(-x))
         f = f.replace(sp.Mod, lambda x, m: x - m * sp.floor(x / m))
     sides: dict[sp.Expr, dict[sp.Basic, tuple[Any, Any]]] = {}
-    atoms = [(a, *_sides(a)) for a in f.atoms(*_STEPS, Relational)]
+    atoms = [
+        (a, *_sides(a)) for a in f.atoms(*_STEPS, Relational) if not isinstance(a, sp.Max | sp.Min) or len(a.args) == 2
+    ]
     atoms += [side for a in f.atoms(sp.Function) for side in _sides_of_quotient(a)]
     for a, g, above, below in atoms:
         if g.free_symbols & wanted:
@@ -104,7 +107,7 @@ def _decided(
 
 def _sides(a: sp.Basic) -> tuple[sp.Expr, Any, Any]:
     """The g at whose zeros an atom may jump, without a factor, and the values on either side of it."""
-    x = a.lhs - a.rhs if isinstance(a, Relational) else a.args[0]
+    x = a.args[0] - a.args[1] if isinstance(a, Relational | sp.Max | sp.Min) else a.args[0]
     factor, g = x.primitive() if x.is_Add else x.as_coeff_Mul()
     values: tuple[Any, Any]
     if isinstance(a, Relational):
@@ -115,6 +118,10 @@ def _sides(a: sp.Basic) -> tuple[sp.Expr, Any, Any]:
         values = sp.S.One, sp.S.NegativeOne
     elif isinstance(a, sp.Abs):
         values = x, -x
+    elif isinstance(a, sp.Max | sp.Min):
+        values = a.args if isinstance(a, sp.Max) else a.args[::-1]
+    elif isinstance(a, triangle):
+        return sp.cos(x), *(sp.sin(x) * (sp.pi / 2 - s * sp.cos(x)) for s in (1, -1))
     elif isinstance(a, sp.acot):
         values = sp.pi / 2, -sp.pi / 2
     elif isinstance(a, sp.atan2):
@@ -243,6 +250,7 @@ def _roots(
         coefficients = _values([x, *others], sp.Poly(g, x).all_coeffs())(np.zeros(n), *columns)
         found = [(i, root) for i in range(n) for root in _real_roots(coefficients[:, i])]
         rows, at = np.array([i for i, _ in found], dtype=int), np.array([z for _, z in found], dtype=float)
+        rest = np.zeros(len(at))
     else:
         f = _values([x, *others], [g])
         sizes = np.logspace(-30, 30, 1201)
@@ -258,11 +266,15 @@ def _roots(
         at = _bisected(lambda z: f(z, *fixed)[0], line[k], line[k + 1])
         ulps = f(at * (1 + 64 * EPS), *fixed)[0] - f(at * (1 - 64 * EPS), *fixed)[0]
         told = np.abs(ulps) <= 1e-3 * (np.abs(value[rows, k]) + np.abs(value[rows, k + 1]))
-        rows, at = rows[told], at[told]
+        with np.errstate(all="ignore"):  # what rounding leaves of g, over its slope
+            rest = np.abs(
+                2e-6 * at * f(at, *fixed)[0] / (f(at * (1 + 1e-6), *fixed)[0] - f(at * (1 - 1e-6), *fixed)[0])
+            )
+        rows, at, rest = rows[told], at[told], np.where(np.isfinite(rest), rest, 0.0)[told]
     if x.is_positive:
-        rows, at = rows[at > 0], at[at > 0]
+        rows, at, rest = rows[at > 0], at[at > 0], rest[at > 0]
     at[np.abs(at) < 1e-30] = 0.0  # as near as the line goes
-    off = 16 * EPS * np.abs(at)
+    off = 16 * EPS * np.abs(at) + rest
     if g.is_polynomial(x):
         both = _values([x, *others], [g, sp.diff(g, x)])
         for _ in range(3):
@@ -303,11 +315,11 @@ def _bisected(f: Callable[[np.ndarray], np.ndarray], left: np.ndarray, right: np
 class Zeros:
     """The zeros of a function g of the time alone: of a linear one exactly, of a periodic one by its period."""
 
-    def __init__(self, g: sp.Expr, time: sp.Symbol) -> None:
-        self.g, self.time = g, time
+    def __init__(self, g: sp.Expr, time: sp.Symbol, samples: Mapping[str, Samples] | None = None) -> None:
+        self.g, self.time, self.samples = g, time, samples or {}
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return Zeros, (self.g, self.time)
+        return Zeros, (self.g, self.time, self.samples)
 
     @cached_property
     def root(self) -> float | None:
@@ -328,7 +340,9 @@ class Zeros:
 
     @cached_property
     def _of_time(self) -> Callable[..., np.ndarray]:
-        return _values([self.time], [self.g])
+        terms, symbols = with_symbols([self.g])
+        values = _values([self.time, *symbols.values()], terms)
+        return lambda t: values(t, *(_sampled_at(a, self.time, self.samples, t) for a in symbols))
 
     @cached_property
     def _slope(self) -> Callable[..., np.ndarray]:
@@ -367,7 +381,7 @@ class Switch:
     """A border at which an expression may jump in the time, with functions that are generated once."""
 
     def __init__(self, border: Border, time: sp.Symbol, samples: Mapping[str, Samples]) -> None:
-        self.zeros, self.time, self.samples = Zeros(border.g, time), time, samples
+        self.zeros, self.time, self.samples = Zeros(border.g, time, samples), time, samples
         terms, symbols = with_symbols([*border.above, *border.below])
         n = len(border.above)
         self._border = Border(border.g, tuple(terms[:n]), tuple(terms[n:]))
@@ -403,13 +417,13 @@ class Switch:
             jumps = (np.abs(jump) > JUMP * size + doubt).any(-1)
             return jumps | ~((np.abs(jump) > 0) | (change > 0)).any(-1)
 
-    def times(self, low: float, high: float, step: float) -> np.ndarray:
-        """Return the times (n,) between two others at which the expression jumps; `step` as of `Zeros.within`."""
+    def times(self, low: float, high: float, step: float, kinks: bool = False) -> np.ndarray:
+        """Return the times (n,) at which the expression jumps, or has kinks too; `step` as of `Zeros.within`."""
         if self.zeros.root is not None:
             found = np.array([self.zeros.root])
-            return found[(found > low) & (found < high) & self.at_root]
+            return found[(found > low) & (found < high) & (kinks or self.at_root)]
         found = self.zeros.within(low, high, step)
-        return found[self._jumps(found, step)] if len(found) else found
+        return found[self._jumps(found, step)] if len(found) and not kinks else found
 
 
 def _sampled_at(a: sampled, time: sp.Symbol, samples: Mapping[str, Samples], t: np.ndarray) -> np.ndarray:

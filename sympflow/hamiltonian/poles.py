@@ -11,7 +11,7 @@ import mpmath
 import numpy as np
 import sympy as sp
 
-from sympflow.hamiltonian.removable import Min
+from sympflow.hamiltonian.removable import Min, bose, elliptic_e, elliptic_k
 
 FACTORED = 8  # letters of a polynomial, at most, that is split into factors
 MOST_SHOWN = 100  # characters of terms
@@ -313,13 +313,14 @@ _SINGULAR: dict[Any, Callable[..., Sequence[sp.Expr]]] = {
     sp.gamma: lambda a: [1 / sp.gamma(a)],
     sp.loggamma: lambda a: [1 / sp.gamma(a)],
     sp.LambertW: lambda a, *_: [a + sp.exp(-1).evalf(17)],
-    sp.elliptic_k: lambda m: [1 - m],
-    sp.elliptic_e: lambda *a: [1 - a[-1]],
+    elliptic_k: lambda m: [1 - m],
+    elliptic_e: lambda *a: [1 - a[-1]],
+    bose: lambda a: [a],
     sp.bessely: lambda n, a: [a],
     sp.besselk: lambda n, a: [a],
 }
 """Expressions that vanish where a function is infinite, or ends."""
-_ENDING = sp.log, sp.asin, sp.acos, sp.acosh, sp.atanh, sp.LambertW, sp.elliptic_k, sp.elliptic_e
+_ENDING = sp.log, sp.asin, sp.acos, sp.acosh, sp.atanh, sp.LambertW, elliptic_k, elliptic_e
 _ODD = sp.sinh, sp.tanh, sp.asinh, sp.atan, sp.erf, sp.sign
 
 

@@ -47,7 +47,7 @@ from sympflow.hamiltonian.jumps import (
     split_impulses,
 )
 from sympflow.hamiltonian.poles import Poles, SymbolicPoles
-from sympflow.hamiltonian.removable import Max, sinc
+from sympflow.hamiltonian.removable import BOUNDED, Max, sinc
 
 LARGEST, TINY = sys.float_info.max, 1e-150
 MOST_LEFT_OUT = 100  # degrees of freedom up to the last one that a formula may do without
@@ -76,8 +76,8 @@ class Kick:
 def _evaluation(name: str, order: int) -> Callable[..., Array]:
     """Return a method: an expression, its gradient or its Hessian at arrays (..., n), and at times."""
 
-    def evaluate(self: SymbolicHamiltonian, x: Array, *t: Array) -> Array:
-        return self._derivative(name, order)(x, *t)
+    def evaluate(self: SymbolicHamiltonian, x: Array, *t: Array, **numbers: Any) -> Array:
+        return self._derivative(name, order)(x, *t, **numbers)
 
     return evaluate
 
@@ -265,9 +265,9 @@ class SymbolicHamiltonian(Definition):
         own = [border for border in borders(self.H, [self.time]) if border.g.free_symbols == {self.time}]
         return [Switch(border, self.time, self.samples) for border in own]
 
-    def jump_times(self, low: float, high: float, step: float) -> np.ndarray:
+    def jump_times(self, low: float, high: float, step: float, kinks: bool = False) -> np.ndarray:
         found = [samples.jump_times(low, high) for samples in self.samples.values()]
-        found += [each.times(low, high, step) for each in self._switches]
+        found += [each.times(low, high, step, kinks) for each in self._switches]
         times = np.unique(np.concatenate(found)) if found else np.zeros(0)
         return times[np.diff(times, prepend=-np.inf) > 8 * sys.float_info.epsilon * np.abs(times)]
 
@@ -358,11 +358,11 @@ class SymbolicHamiltonian(Definition):
     kinetic_gradient = _evaluation("T", 1)
     kinetic_hessian = _evaluation("T", 2)
 
-    def gradient(self, y: Array, *t: Array) -> Array:
+    def gradient(self, y: Array, *t: Array, **numbers: Any) -> Array:
         if self.separable:
             q, p = y[..., : self.ndof], y[..., self.ndof :]
-            return concatenate([self.potential_gradient(q, *t), self.kinetic_gradient(p, *t)])
-        return self._derivative("H", 1)(y, *t)
+            return concatenate([self.potential_gradient(q, *t, **numbers), self.kinetic_gradient(p, *t, **numbers)])
+        return self._derivative("H", 1)(y, *t, **numbers)
 
     def evaluated(self, name: str, expressions: list[sp.Expr]) -> Callable[..., Array]:
         """A function of y (..., 2d), and of t, that gives the values (..., n) of expressions, kept under a name."""
@@ -836,7 +836,7 @@ def _modules(library: str, code: list[sp.Expr]) -> list[Any]:
     if library == "torch":
         known |= {"erf", "tensor_erfc"}
     names = {type(f).__name__ for expression in code for f in expression.atoms(sp.Function)} - {"integer_power"}
-    special = sorted(names - known - {"Max", "Min", "Abs", "Heaviside", "sign", "Piecewise"})
+    special = sorted(names - known - {"Max", "Min", "Abs", "Heaviside", "sign", "Piecewise", *BOUNDED})
     if library == "numpy":
         own = {"integer_power": _integer_power, "Heaviside": np.heaviside}
         return [own | _special_functions(), "scipy", "numpy"] if special else [own, "numpy"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import cache, partial
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -46,10 +47,15 @@ PHASES, PHASE_ERROR = np.geomspace(1e-3, 3.0, 400), 0.01
 """Where energy is not kept, a step is too long if an oscillation is off by so much of a radian, or beyond the last."""
 LARGE = 200  # degrees of freedom
 FEW_STEPS = 20
+MOST_AGAIN = 100  # steps on a clock, which are made again in halves
 SAFE = 4  # steps of so many `dt` of a system are not looked at in a run of few
 FEWEST_NEAR, LOST_DIGITS = 100, 1e-9
 """The closest of so many steps, or of all, to a value where terms cancel is that part of the way from it; a force with
 that share of errors there is told."""
+NO_FORCE = (
+    "At the last state the force is NaN: write H without parts that overflow, such as exp(800), or are 0/0; shorter "
+    "steps do not help. Start elsewhere"
+)
 STATES_COMPARED, MOST_COMPARED = 16, 64
 """Outputs of a run, and states of a batch, at which H is compared with that of the flow."""
 MANY_TIMES = 1000.0  # times the certified energy error of a flow beyond which an error outside its domain is warned of
@@ -95,7 +101,7 @@ def diagnose(
         check_domain(outcome, integrator, between, action)
         if held and between is system:
             warn_of_loss(outcome, integrator, system, y0)
-    if held and not told and problem.diagnosed and rows is None:
+    if held and not told and problem.diagnosed and not problem.followed:
         warn_of_long_steps(outcome, integrator, problem)
 
 
@@ -310,23 +316,64 @@ def _end(
 
 
 def warn_of_long_steps(outcome: Outcome, integrator: Integrator, problem: Problem) -> None:
-    """Warn of what a method doubts, and of fixed steps with which the energy is off by `TOO_LONG` of its size."""
-    if not isinstance(integrator, FixedStep):
-        return
+    """Warn of what a method doubts, and of steps with which the energy is off by `TOO_LONG` of its size."""
     system, n, n_steps = problem.system, len(outcome.t), outcome.stats.get("n_steps", 0)
-    if doubt := integrator.doubt(system):
-        warn(doubt, RuntimeWarning)
+    dt, known, few = None, False, False
+    if isinstance(integrator, FixedStep):
+        if doubt := integrator.doubt(system):
+            warn(doubt, RuntimeWarning)
+        dt = integrator.step_length(system)
+        known = integrator.dt is None or (not system.step_is_open and integrator.dt <= system.dt)
+        few = n_steps < FEW_STEPS and (known or dt <= SAFE * system.dt)
     if integrator.trained:
         return
-    known = integrator.dt is None or (not system.step_is_open and integrator.dt <= system.dt)
-    few = n_steps < FEW_STEPS and (known or integrator.step_length(system) <= SAFE * system.dt)
     seen = LOOKED_AT * (not few) if system.ndof <= LARGE else min(LOOKED_AT, n_steps // 200)
-    looked = n and n_steps >= FEW_STEPS and not (known or system.keeps_energy)
-    if looked and (told := _too_fast(outcome, integrator, problem)):
-        warn(told, RuntimeWarning)
-    if not n or not seen or not system.keeps_energy or system.between_impulses is not system:
+    fixed = integrator if isinstance(integrator, FixedStep) and not known else None
+    if not system.keeps_energy:
+        if (
+            fixed
+            and n
+            and n_steps >= FEW_STEPS
+            and problem.parameter_values is None
+            and (told := _too_fast(outcome, fixed, problem))
+        ):
+            warn(told, RuntimeWarning)
         return
-    width = 2 * system.ndof
+    if not n or not seen or system.between_impulses is not system:
+        return
+    off = _energy_off(outcome, problem, seen, dt is None)
+    told = "the energy of the run " + ("overflows" if off == math.inf else f"is off by {100 * off:.2g} %")
+    if off <= TOO_LONG and fixed and fixed.in_another_time and n_steps <= MOST_AGAIN:
+        off = _end_off(outcome, fixed, problem)
+        told = f"with half of it the run ends {100 * off:.2g} % of its size away"
+    if off > TOO_LONG:
+        what, remedy = "`rtol` is too large", "Take rtol=1e-8, or a method of fixed steps with tol=1e-6"
+        if dt is not None:
+            what, remedy = f"`dt` {dt:g} is too long", "Take a shorter step, or tol=1e-6, for which it is chosen"
+        warn(f"{what} for method {integrator.label!r}: {told}. {remedy}.", RuntimeWarning)
+
+
+def try_steps(integrator: Integrator, system: HamiltonianSystem, t_span: tuple[float, float], y0: np.ndarray) -> None:
+    """Warn of poles passed, and steps that are too long, in the first steps of some of the orbits from y0 (N, 2d)."""
+    t0, t1 = t_span
+    end = t0 + math.copysign(min(abs(t1 - t0), MOST_TRIED * (integrator.step_length(system) or system.dt)), t1 - t0)
+    one = len(y0) == 1 or integrator.one_by_one or system.ndof > LARGE
+    piece = Problem(system, t0, end, y0[0] if one else y0[:LOOKED_AT], save_every=MOST_TRIED // LOOKED_AT)
+    try:
+        outcome = integrator.run(piece)
+    except Exception:  # which the run itself tells
+        return
+    if not _failed(outcome):
+        diagnose_piece(outcome, integrator, piece, None)
+        if _failed(outcome):
+            warn(f"`system`: {outcome.message}", RuntimeWarning)
+        else:
+            warn_of_long_steps(outcome, integrator, piece)
+
+
+def _energy_off(outcome: Outcome, problem: Problem, seen: int, each: bool) -> float:
+    """The largest change of H at the start and some outputs, over its size, at `each` or at most; 0 if not known."""
+    system, n, width = problem.system, len(outcome.t), 2 * problem.system.ndof
     every = slice((n - 1) % (step := -(-n // seen)), None, step)  # the last among them
     if problem.y0.ndim == 1 and n <= seen and outcome.t[0] == problem.t0:
         y = to_numpy(outcome.y)
@@ -336,26 +383,37 @@ def warn_of_long_steps(outcome: Outcome, integrator: Integrator, problem: Proble
             for part in (problem.y0, outcome.y[every])
         )
         y = np.concatenate([*parts])[:, :LOOKED_AT].astype(float)
+    functions: Any = system
+    numbers: dict[str, Any] = {}
+    if problem.parameter_values is not None:
+        assert system.symbols is not None
+        functions, numbers = system.symbols.parametric, {"numbers": problem.parameter_values[:, :LOOKED_AT]}
     with np.errstate(all="ignore"):
         try:
-            H = np.asarray(system.hamiltonian(y))
+            H = np.asarray(functions.hamiltonian(y, **numbers))
             if (H.max(0) - H.min(0) <= TOO_LONG * np.abs(H[0])).all():
-                return
-            change = np.abs(H - H[0]).max(0)
+                return 0.0
+            change = np.abs(H - H[0])
             if not (change > TOO_LONG * np.abs(H[0])).any():
-                return
-            size = 0.5 * np.abs(y * np.asarray(system.gradient(y))).sum(-1).max(0)
+                return 0.0
+            size = 0.5 * np.abs(y * np.asarray(functions.gradient(y, **numbers))).sum(-1)
+            size = size if each else size.max(0)
         except (ArithmeticError, ValueError, TypeError):  # a function that takes no batches
-            return
+            return 0.0
         off = np.fmax.reduce(change / np.maximum(size, system.energy_scale or 0.0), axis=None)  # of a rest 0/0
-    overflows = bool(np.isfinite(H[0]).all() and np.isinf(change).any())
-    if TOO_LONG < off < np.inf or overflows:
-        found = "overflows" if overflows else f"is off by {100 * off:.2g} %"
-        warn(
-            f"`dt` {integrator.step_length(system):g} is too long for method {integrator.label!r}: the energy of the "
-            f"run {found}. Take a shorter step, or tol=1e-6, for which it is chosen.",
-            RuntimeWarning,
-        )
+    if np.isfinite(H[0]).all() and np.isinf(change).any():
+        return math.inf
+    return float(off) if off < math.inf else 0.0
+
+
+def _end_off(outcome: Outcome, integrator: FixedStep, problem: Problem) -> float:
+    """How far a run with half the step ends from an outcome, over the size of q or p; 0 where that is not known."""
+    end, half = float(outcome.t[-1]), replace(integrator, dt=0.5 * integrator.step_length(problem.system))
+    again = half.run(replace(problem, t1=end, t_eval=np.array([end]), events=None, progress=None))
+    if _failed(again) or not len(again.t):
+        return 0.0
+    y, other = (np.stack(np.split(to_numpy(x[-1]), 2, axis=-1)).reshape(2, -1) for x in (outcome.y, again.y))
+    return float(np.max(np.abs(y - other).max(1) / np.maximum(np.abs(y).max(1), 1e-300)))
 
 
 def _too_fast(outcome: Outcome, integrator: FixedStep, problem: Problem) -> str:
@@ -427,6 +485,9 @@ def _note_last_state(outcome: Outcome, problem: Problem) -> None:
     t, y = problem.t0, to_numpy(problem.y0).reshape(-1, 2 * d)[row]
     if finite.size:
         t, y = float(outcome.t[finite[-1]]), outputs[finite[-1]]
+    with np.errstate(all="ignore"), suppress(ArithmeticError, ValueError, TypeError):
+        if np.isnan(problem.system.vector_field(y, t)).any() and np.isfinite(y).all():
+            outcome.message = outcome.message.replace("Reduce `dt`", NO_FORCE)
     remark = problem.system.definition.remark(y[:d])
     if remark:
         outcome.message += f" At t = {t:.10g} {remark}"

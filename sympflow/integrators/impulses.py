@@ -22,9 +22,12 @@ ASIDE = 64 * EPS
 
 
 def landings(
-    integrator: Integrator, system: HamiltonianSystem, t0: float, t1: float, able: bool = True
+    integrator: Integrator, system: HamiltonianSystem, t0: float, t1: float, able: bool = True, kinks: bool = False
 ) -> tuple[str, list[float]]:
-    """The warning of a run that loses its order at jumps of H in t; or, if it is `able`, those at which it is cut."""
+    """The warning of a run that loses its order at jumps of H in t; or, if it is `able`, those at which it is cut.
+
+    By fixed steps of more than second order it is cut at `kinks` of H too.
+    """
     if not system.definition.may_jump or not math.isfinite(t1) or t0 == t1:
         return "", []
     dt, at_ends, said = integrator.step_length(system), integrator.forces_at_ends(system), ""
@@ -37,9 +40,7 @@ def landings(
             "pulse. Solve in shorter intervals, or by a fixed `dt` that divides all pieces between jumps."
         )
     elif dt is not None:
-        t = np.array(times)
-        x = (t - t0) / dt
-        within = t[np.abs(x - np.round(x)) > np.maximum(1e-9, 8 * EPS * np.maximum(abs(t0), np.abs(t)) / dt)]
+        within = _within(times, t0, dt)
         ends = [t for t in (t0, t1) if at_ends and _jumps_into(system, t, t0, t1, dt)]
         times = sorted([*ends, *times], reverse=t1 < t0)
         if len(within):
@@ -54,13 +55,24 @@ def landings(
                 f"at one, at t = {times[0]:.6g}: it is of first order there. Use one that takes none, such as "
                 "'leapfrog', 'kahan_li8' or 'gauss_legendre6'."
             )
-    if not said:
-        return "", []
-    able = able and len(times) <= MOST_LANDINGS and not integrator.forces_beyond(system)
-    # all times are known, of which the first ones may be listed
-    if able and times and not len(system.jump_times(max(times), max(t0, t1), step)):
-        return "", times
+    if not able or integrator.forces_beyond(system):
+        return said, []
+    cuts = [(times, False)] if said else []
+    if kinks and dt is not None and (integrator.order or 0) > 2:
+        bends = system.jump_times(min(t0, t1), max(t0, t1), step, True)
+        if len(_within(bends, t0, dt)):
+            cuts.insert(0, (sorted({*bends.tolist(), *times}), True))
+    for met, bent in cuts:  # all times are known, of which the first ones may be listed
+        if 0 < len(met) <= MOST_LANDINGS and not len(system.jump_times(max(met), max(t0, t1), step, bent)):
+            return "", met
     return said, []
+
+
+def _within(times: Any, t0: float, dt: float) -> np.ndarray:
+    """The times (n,) that are no ends of steps from t0."""
+    t = np.array(times)
+    x = (t - t0) / dt
+    return t[np.abs(x - np.round(x)) > np.maximum(1e-9, 8 * EPS * np.maximum(abs(t0), np.abs(t)) / dt)]
 
 
 def _jumps_into(system: HamiltonianSystem, t: float, t0: float, t1: float, dt: float) -> bool:
@@ -86,7 +98,7 @@ def spans(t0: float, t1: float, ends: Collection[float], jumps: Sequence[float])
 
 def pieces_of(integrator: Integrator, system: HamiltonianSystem, t0: float, t1: float) -> list[tuple[float, float]]:
     """The pieces of a run of a system without impulses."""
-    return [piece[:2] for piece in spans(t0, t1, [], landings(integrator, system, t0, t1)[1])]
+    return [piece[:2] for piece in spans(t0, t1, [], landings(integrator, system, t0, t1, kinks=True)[1])]
 
 
 def run_in_pieces(

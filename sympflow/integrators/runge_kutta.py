@@ -126,5 +126,6 @@ def hopeless(n_steps: int, t0: float, t: float, t1: float, most: int) -> str | N
     return (
         f"After {n_steps:,} steps t = {t:.15g} is reached, and at this pace the end needs about {pace:.1g} more; "
         f"`max_steps` is {most:,}. Raise it, or `max_step` or the tolerances, or end `t_span` earlier; a fixed-step "
-        "method may do with fewer steps."
+        "method may do with fewer steps. Where the motion is slow, such short steps mean that the force is rough: "
+        "terms of H that cancel lose digits, and are to be written otherwise."
     )

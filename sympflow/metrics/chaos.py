@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 from sympflow.arguments import as_float, check_counts, check_one_of, check_t_eval, floats, warn
 from sympflow.hamiltonian.scales import weights
 from sympflow.integrators.contract import FINISHED
+from sympflow.integrators.diagnosis import try_steps
 from sympflow.integrators.grid import Grid
 from sympflow.integrators.impulses import landings
 from sympflow.integrators.registry import naming_plugin
@@ -461,6 +462,7 @@ def _volume(vectors: np.ndarray) -> np.ndarray:
 
 
 def _reported(run: _Run, orbits: Orbits, times: np.ndarray, kind: int, below: float) -> Indicator:
+    try_steps(orbits.integrator, orbits.system, orbits.t_span, orbits.rows)
     values = run.spread
     if kind == NONE:
         with np.errstate(all="ignore"):

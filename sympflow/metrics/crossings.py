@@ -13,6 +13,7 @@ import numpy as np
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep, Integrator, Problem
 from sympflow.integrators.contract import FINISHED
+from sympflow.integrators.diagnosis import try_steps
 from sympflow.integrators.grid import Grid
 from sympflow.integrators.registry import naming_plugin
 from sympflow.solver import solve
@@ -51,6 +52,7 @@ def crossings(
 ) -> Crossings:
     """All crossings of the trajectories from `rows` (N, 2d), two of one within the time `sample` excepted."""
     if isinstance(integrator, FixedStep) and integrator.on_grid:
+        try_steps(integrator, system, t_span, rows)
         with naming_plugin(integrator):
             return _Search(integrator, system, plane, sample).run(t_span, rows)
     return _by_events(integrator, system, t_span, rows, plane, sample)

@@ -86,7 +86,7 @@ def _balanced(sol: Solution) -> tuple[np.ndarray, np.ndarray]:
     H = np.asarray(system.hamiltonian(y, np.broadcast_to(sol.t, y.shape[:-1])))
     if system.keeps_energy:
         return H, np.zeros(H.shape)
-    extended = extended_system(system)
+    extended = None if system.definition.may_jump else extended_system(system)  # whose steps meet no kinks
     integrator = None if extended is None else sol.integrator.on_extended(system, extended)
     if extended is None or integrator is None:
         return H, _quadrature(sol)

@@ -13,6 +13,7 @@ from sympflow.arguments import real_number, warn
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep
 from sympflow.integrators.contract import FINISHED, Problem
+from sympflow.integrators.diagnosis import try_steps
 from sympflow.integrators.grid import Grid
 from sympflow.integrators.impulses import landings, pieces_of
 from sympflow.integrators.registry import naming_plugin
@@ -165,6 +166,7 @@ def escapes(orbits: Orbits, region: Outside, backend: str) -> tuple[np.ndarray, 
     if told:
         warn(told, RuntimeWarning)
     rows = orbits.rows
+    try_steps(integrator, orbits.system, orbits.t_span, rows)
     most = max(1, MOST_VALUES // (WINDOW * rows.shape[1]))
     with naming_plugin(integrator):
         parts = [_escapes(integrator, orbits, rows[i : i + most], region, backend) for i in range(0, len(rows), most)]

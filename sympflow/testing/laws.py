@@ -51,7 +51,7 @@ def run(
     """A solution of the integrator's, from the system's y0 unless another is given."""
     y0 = start(system) if y0 is None else y0
     with warnings.catch_warnings():  # the methods of low order are judged by their laws, at any step
-        warnings.filterwarnings("ignore", "`dt` .* is too long", RuntimeWarning)
+        warnings.filterwarnings("ignore", "`(dt|rtol)` .* is too (long|large)", RuntimeWarning)
         return solve(system, integrator, t_span, y0=y0, on_domain_exit="ignore", **arguments)
 
 

@@ -61,10 +61,8 @@ class LatticeSubsystem:
         """The subsystem of a lattice, for states of a domain of it."""
         found = domain if isinstance(domain, LatticeStates) else LatticeStates.of_states(lattice, domain.sample(DRAWN))
         small = lattice.ndof <= MOST_FITTED
-        few = lattice if small else lattice.subsystem()
-        local = few.local
-        assert local is not None
-        H, written = local.written_out(), few
+        few: Any = lattice if small else lattice.subsystem()
+        H, written = few.local.written_out(), few
         if H is not None:
             scene: Any = {"damping": lattice.damping, "t_span": lattice.t_span, "dt": lattice.dt}
             written = HamiltonianSystem.from_sympy(H, name=lattice.name, **scene)
@@ -88,15 +86,12 @@ class LatticeSubsystem:
         flow.recipe = {name: value for name, value in fitted.recipe.items() if name != "scaling"}
         flow.recipe["fitted_on"] = self.few.ndof
         flow.figures, flow.history = dict(fitted.figures), fitted.history
-        local = self.lattice.local
-        if self.lattice.damping is None and local is not None and local.uniform and local.ends:
+        local: Any = self.lattice.local
+        if self.lattice.damping is None and local.uniform and local.ends:
             flow.figures |= {f"ends_{end}": self._error_at(flow, end) for end in BOUNDARIES}
-        assert local is not None
         smaller = local.judged()  # with the same ends
-        judged, own = self.lattice.subsystem(*smaller) if smaller else self.lattice, flow
-        assert judged.local is not None
-        if judged is not self.lattice:
-            own = flow.bound(judged)
+        judged: Any = self.lattice.subsystem(*smaller) if smaller else self.lattice
+        own = flow.bound(judged) if smaller else flow
         domain = self.states.of(judged)
         width = judged.local.numbers
         n = max(FEWEST, min(MOST_ORBITS, NUMBERS // width))
@@ -126,8 +121,7 @@ class LatticeSubsystem:
 
     def _error_at(self, flow: PrimedFlow, end: str) -> float:
         """The relative energy error, above rest, of a few in a row with such ends: the median over states."""
-        few = self.lattice.subsystem()
-        assert few.local is not None
+        few: Any = self.lattice.subsystem()
         row = self.lattice.subsystem((COPIES * few.local.shape[0], *few.local.shape[1:]), (end, *few.local.ends[1:]))
         domain = self.states.of(row)
         x = states(domain, ENDS_STATES, 0, Stream.VALIDATION)
@@ -210,8 +204,7 @@ def check_runs(system: HamiltonianSystem, fit: PrimedFit) -> None:
 
 def runs_of(subsystem: LatticeSubsystem, runs: int, seed: int, fitted: PrimedFlow) -> EnergyRuns:
     """Return the energy errors in so many runs of a larger subsystem, by the numbers of a flow of the subsystem."""
-    whole = subsystem.lattice
-    assert whole.local is not None
+    whole: Any = subsystem.lattice
     larger = whole.subsystem(*whole.local.many())
     domain = subsystem.states.of(larger)
     x = states(domain, runs, seed, Stream.RUNS)

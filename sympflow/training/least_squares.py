@@ -166,10 +166,7 @@ def levenberg_marquardt(
         return model
 
     level = Damping(damping, LEAST_DAMPING)
-    try:
-        costs = [cost_at(x)]
-    except OutOfTime:
-        return Minimum(x, math.inf, 0, STOPPED)
+    costs = [cost_at(x)]
     if not math.isfinite(costs[0]):
         return Minimum(x, math.inf, 0, "the residuals are not finite at the start")
     options: Any = {"damping": level, "tries": MAX_REJECTED, "iterations": iterations, "patience": patience}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -179,7 +180,7 @@ class _Compiled:
         self,
         weight: float,
         loss: Loss,
-        flow: FlowMap,
+        flow: Any,
         tangents: NetworkTangents,
         t: Tensor,
         x: Tensor,

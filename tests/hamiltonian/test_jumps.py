@@ -27,6 +27,56 @@ def driven(drive, **scene):
     return made(p**2 / 2 - q * drive, time="t", **scene)
 
 
+# kinks ---------------------------------------------------------------------------------------------
+
+
+def triangle(x):
+    """asin(sin x), by whole turns."""
+    turn = np.mod(x + PI / 2, 2 * PI) - PI
+    return PI / 2 - np.abs(turn)
+
+
+KINKS = {
+    "asin(sin(3*t))": lambda s: triangle(3 * s),
+    "acos(cos(t + 0.4))": lambda s: PI / 2 - triangle(s + 0.4 + PI / 2),
+    "asin(cos(t))*t": lambda s: triangle(s + PI / 2) * s,
+    "abs(sin(t))": lambda s: np.abs(np.sin(s)),
+    "Max(sin(2*t), 0.3)": lambda s: np.maximum(np.sin(2 * s), 0.3),
+    "Min(t, 5) + abs(t - 2.03)": lambda s: np.minimum(s, 5) + np.abs(s - 2.03),
+}
+
+
+@pytest.mark.parametrize("drive", KINKS)
+def test_methods_of_high_order_keep_it_at_kinks_in_t(drive):
+    force, ends = KINKS[drive], np.linspace(0, 12, 7)
+    exact = solve_ivp(
+        lambda s, y: [y[1], force(s) - y[0]], (0, 12), [1, 0], "DOP853", ends, rtol=1e-13, atol=1e-13, max_step=2e-3
+    )
+    sol = solve(made(f"p**2/2 + q**2/2 - q*({drive})", time="t"), "kahan_li8", (0, 12), [1, 0], dt=0.05, t_eval=ends)
+    np.testing.assert_allclose(sol.y, exact.y, atol=1e-9)
+
+
+def test_kinks_of_samples_are_met():
+    times = np.linspace(0, 20, 41)
+    a = CubicSpline(times, np.sin(times))
+    system = made("p**2/2 + q**2/2 - q*Max(a, 0)", time="t", params={"a": a})
+    sol = solve(system, "kahan_li8", (0, 20), [1, 0], dt=0.05)
+    exact = solve_ivp(
+        lambda s, y: [y[1], max(a(s), 0) - y[0]], (0, 20), [1, 0], "DOP853", rtol=1e-12, atol=1e-12, max_step=1e-2
+    )
+    np.testing.assert_allclose(sol.y[:, -1], exact.y[:, -1], atol=1e-8)
+
+
+def test_the_force_of_a_triangle_wave_is_that_of_its_sides():
+    q = np.array([5.0, 1.0, -1.0, 2.0, 7.0])
+    system = made("p**2/2 + asin(sin(q)) + 10*acos(cos(q))")
+    y = np.stack([q, 0 * q], axis=-1)
+    np.testing.assert_allclose(system.gradient(y)[:, 0], np.sign(np.cos(q)) + 10 * np.sign(np.sin(q)))
+    np.testing.assert_allclose(system.hamiltonian(y), np.arcsin(np.sin(q)) + 10 * np.arccos(np.cos(q)))
+    sol = solve(system, "verlet", (0, 0.1), y, dt=0.1)
+    np.testing.assert_allclose(sol.y[:, 0, -1], q - 0.005 * system.gradient(y)[:, 0])
+
+
 # impulses ------------------------------------------------------------------------------------------
 
 COMB = made(p**2 / 2 + q**2 / 2 - q * sum(sp.DiracDelta(t - k * sp.pi) for k in range(1, 21)), time="t", y0=[0, 0])
@@ -186,6 +236,14 @@ def test_impulses_without_a_meaning_are_refused_where_a_run_meets_them(H, words)
     with pytest.raises(ValueError, match=rf"^`t_span` .* has impulses DiracDelta.*{words}"):
         solve(system, "leapfrog", (0, 3), backend="array")
     assert solve(system, "leapfrog", (0, 0.5), backend="array").success
+
+
+def test_outputs_between_impulses_move_with_their_times():
+    system = made(p**2 / 2 + q**2 / 2 - q * sp.DiracDelta(t - 1) / 4, time="t", y0=[1.0, 0.0])
+    start, end = (torch.tensor(x, dtype=torch.float64, requires_grad=True) for x in (0.0, 2.0))
+    solve(system, "kahan_li8", (start, end), dt=0.01).y[0, -1].backward()  # q = cos(t1 − t0) + sin(t1 − 1)/4
+    assert float(start.grad) == pytest.approx(math.sin(2), abs=1e-10)
+    assert float(end.grad) == pytest.approx(math.cos(1) / 4 - math.sin(2), abs=1e-10)
 
 
 # jumps in states -----------------------------------------------------------------------------------

@@ -57,6 +57,7 @@ def test_one_nan_is_not_hidden_by_the_maximum():
     assert max_energy_error(replace(sol, y=y)) == np.inf
 
 
+@pytest.mark.filterwarnings("ignore:`rtol` is too large for method .rk45.:RuntimeWarning")
 def test_drift_of_verlet_is_insignificant_and_that_of_rk45_is_not():
     system, t = systems.henon_heiles(), np.linspace(0, 400, 4001)
     verlet, rk45 = (energy_drift(solve(system, method, (0, 400), t_eval=t)) for method in ("verlet", "rk45"))

@@ -14,6 +14,7 @@ from sympflow.integrators.tableaux import ADAPTIVE
 HH, OSCILLATOR = systems.henon_heiles(), systems.harmonic_oscillator()
 
 
+@pytest.mark.filterwarnings("ignore:`dt` 0.05 is too long for method .euler.:RuntimeWarning")
 @pytest.mark.parametrize("method", KINDS)
 def test_the_crossings_are_those_that_events_find(method):
     def g(t, y):

@@ -52,7 +52,7 @@ def test_numbers_that_overflow_are_not_finite_without_the_warnings_of_numpy():
     """Trials of a search may be anything: forces of a quartic potential beyond 1e308, and the squares of others."""
     system = HamiltonianSystem.from_sympy("p**2/2 + q**4/4", domain=Box([-1, -1], [1, 1]))
     flow = SympFlow.primed(system, 3, dt=1.0, processor=2).requires_grad_(False)
-    run = TableRun.start(flow, system, system.domain, Scaling.unit(1), PrimedFit(points=5, reference_states=5))
+    run = TableRun(flow, system, system.domain, Scaling.unit(1), PrimedFit(points=5, reference_states=5))
     for size in (1e30, 1e100, 1e200):
         run.table.assign(size * np.random.default_rng(0).normal(size=flow.n_parameters))
         theta = run.table.parameters()
