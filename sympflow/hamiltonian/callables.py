@@ -78,7 +78,7 @@ class CallableHamiltonian(Definition):
             self.numba_functions = given = potential, gradient, hessian_vector
             V, slope, product = (NumbaFunction(given, order) for order in range(3))
             functions = V, None, slope, None if hessian_vector is None else product
-        of_arrays = [None if f is None else _OverTimes(f) if timed else f for f in functions]
+        of_arrays = [None if f is None else partial(_over_times, f) if timed else f for f in functions]
         self._potential, self._hamiltonian, self._gradient, self._hessian_vector = of_arrays
         self.given_functions = self.numba_functions is None
 
@@ -564,32 +564,28 @@ def _checked(value: Any, x: Array, name: str, tail: tuple[int, ...]) -> Array:
 _ARGUMENTS = {"potential": "q", "hamiltonian": "q, p", "gradient": "q", "hessian_vector": "q, v"}
 
 
-class _OverTimes:
+def _over_times(function: Callable[..., Any], t: Any, *states: Array) -> Any:
     """A function of a user whose first argument is the time, one number: of states (..., k) at one time, or each."""
 
-    def __init__(self, function: Callable[..., Any]) -> None:
-        self.function = function
+    def at(t: Any, *states: Array) -> Any:
+        return function(beside(t, states[0]) if is_tensor(states[0]) else float(t), *states)
 
-    def __call__(self, t: Any, *states: Array) -> Any:
-        if not getattr(t, "ndim", 0):
-            return self._at(t, *states)
-        flat, times = [x.reshape(-1, x.shape[-1]) for x in states], t.reshape(-1)
-        if (found := values(times)) is not None and (found == found[..., :1]).all():
-            return self._at(times[0], *states)
-        if is_tensor(times):
-            each = [self._at(s, *(x[i] for x in flat)) for i, s in enumerate(times)]
-            return stack(each, axis=0).reshape(*t.shape, *each[0].shape)
-        distinct, which = np.unique(times, return_inverse=True)
-        groups = [np.flatnonzero(which == k) for k in range(len(distinct))]
-        parts = [self._at(s, *(x[rows] for x in flat)) for s, rows in zip(distinct.tolist(), groups, strict=True)]
-        for part, rows in zip(parts, groups, strict=True):
-            if getattr(part, "shape", ())[:1] != rows.shape:
-                return part  # which is refused by its shape
-        result = concatenate(parts, 0)[np.argsort(np.concatenate(groups))]
-        return result.reshape(*t.shape, *result.shape[1:])
-
-    def _at(self, t: Any, *states: Array) -> Any:
-        return self.function(beside(t, states[0]) if is_tensor(states[0]) else float(t), *states)
+    if not getattr(t, "ndim", 0):
+        return at(t, *states)
+    flat, times = [x.reshape(-1, x.shape[-1]) for x in states], t.reshape(-1)
+    if (found := values(times)) is not None and (found == found[..., :1]).all():
+        return at(times[0], *states)
+    if is_tensor(times):
+        each = [at(s, *(x[i] for x in flat)) for i, s in enumerate(times)]
+        return stack(each, axis=0).reshape(*t.shape, *each[0].shape)
+    distinct, which = np.unique(times, return_inverse=True)
+    groups = [np.flatnonzero(which == k) for k in range(len(distinct))]
+    parts = [at(s, *(x[rows] for x in flat)) for s, rows in zip(distinct.tolist(), groups, strict=True)]
+    for part, rows in zip(parts, groups, strict=True):
+        if getattr(part, "shape", ())[:1] != rows.shape:
+            return part  # which is refused by its shape
+    result = concatenate(parts, 0)[np.argsort(np.concatenate(groups))]
+    return result.reshape(*t.shape, *result.shape[1:])
 
 
 def _check_arguments(name: str, function: Callable[..., Any], arguments: str, timed: bool) -> None:

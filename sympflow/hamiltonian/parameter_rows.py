@@ -22,9 +22,7 @@ from sympflow.lazy import lately_kept
 MOST_SHOWN = 4  # values of a row, in messages
 
 
-@lately_kept
-def _of_values(system: HamiltonianSystem, **values: float) -> HamiltonianSystem:
-    return system.with_params(**values)
+_of_values = lately_kept(HamiltonianSystem.with_params)
 
 
 class Rows(NamedTuple):
