@@ -29,6 +29,8 @@ def certify(
     flow: Any, system: HamiltonianSystem, domain: Domain, weights: str, size: Mapping[str, int], t_end: float
 ) -> Certificate:
     """Find the certificate of a flow on a domain: `FlowMap.certificate`; `weights` is their checksum."""
+    from sympflow.hamiltonian.exact_flow import reference_step
+
     states, times, held_out, seed = (size[name] for name in ("states", "times", "held_out", "seed"))
     system.check_conservative(
         "which takes energy away, and a certificate bounds the error of an energy that is kept",
@@ -40,6 +42,8 @@ def certify(
     )
     x, unseen = (domain.sample(n, _seed(seed, i)) for i, n in enumerate((states, held_out)))
     energy, relative, left = _energy_errors(flow, system, domain, unseen, t_end)
+    with torch.no_grad():
+        end = flow.psi(flow.dt, torch.as_tensor(unseen, dtype=flow.dtype, device=flow.device)).cpu().double().numpy()
     return Certificate(
         system.name,
         flow.dt,
@@ -49,7 +53,7 @@ def certify(
         *_over_sample(flow, system, domain, x, times, np.random.default_rng(_seed(seed, 2))),
         held_out,
         float(t_end),
-        _one_step_error(flow, system, unseen),
+        Quantiles.of(np.linalg.norm(end - reference_step(system, unseen, flow.dt), axis=-1)),
         Quantiles.of(energy),
         Quantiles.of(relative),
         left,
@@ -119,14 +123,6 @@ def _over_sample(
     rates[:, 2] = _largest_nearby(rate, domain, instants, x, np.array(gains), rng, numbers)
     delta = Quantiles(*(float(np.trapezoid(column, dx=flow.dt / (times - 1))) for column in rates.T))
     return Quantiles.of(doubles(torch.stack(defects))), Quantiles.of(doubles(torch.stack(mismatches))), delta
-
-
-def _one_step_error(flow: Any, system: HamiltonianSystem, x: np.ndarray) -> Quantiles:
-    from sympflow.hamiltonian.exact_flow import reference_step
-
-    with torch.no_grad():
-        y = flow.psi(flow.dt, torch.as_tensor(x, dtype=flow.dtype, device=flow.device)).cpu().double().numpy()
-    return Quantiles.of(np.linalg.norm(y - reference_step(system, x, flow.dt), axis=-1))
 
 
 def _energy_errors(

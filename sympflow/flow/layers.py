@@ -10,13 +10,10 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import torch
 from torch import Tensor, nn
 
-from sympflow.compiler import NotCompiled
-from sympflow.flow.potentials import NO_NETWORK, Potential, Time, by_time
+from sympflow.flow.potentials import Potential, Time, by_time
 
 if TYPE_CHECKING:  # a flow needs it only to be compiled
     from sympflow.hamiltonian.system import HamiltonianSystem
-    from sympflow.kernels.network_tangents import TrainedNetwork
-    from sympflow.kernels.networks import NetworkLayer
 
 
 class Layer(nn.Module):
@@ -52,14 +49,6 @@ class Layer(nn.Module):
 
     def to_dict(self) -> dict[str, Any]:
         raise NotImplementedError
-
-    def network(self) -> NetworkLayer:
-        """Return its weights for compiled loops; a ValueError if it is not a kick or a drift with an MLP potential."""
-        raise NotCompiled(NO_NETWORK)
-
-    def trained(self) -> TrainedNetwork | None:
-        """Return its network for compiled derivatives by the parameters; None if there are none."""
-        return None
 
 
 class OwnLayer(Layer):
@@ -147,12 +136,6 @@ class PotentialLayer(Layer):
 
     def to_dict(self) -> dict[str, Any]:
         return {"kind": self.kind, "potential": self.potential.to_dict()}
-
-    def network(self) -> NetworkLayer:
-        return self.potential.network(self.kind == "kick")
-
-    def trained(self) -> TrainedNetwork | None:
-        return self.potential.trained()
 
 
 class Kick(PotentialLayer):

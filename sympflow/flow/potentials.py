@@ -37,8 +37,6 @@ T = TypeVar("T")
 ACTIVATION_GROUP, POTENTIAL_GROUP = "sympflow.activations", "sympflow.potentials"
 """The entry-point groups in which a distribution announces its activations and potentials: files name them."""
 
-NO_NETWORK = "`flow` has layers other than kicks and drifts with MLP potentials: use backend='array'."
-
 
 class Unregistered(ValueError):
     """A name of an activation or a potential that nothing is registered under; `what` and `remedy` are for messages."""
@@ -312,14 +310,6 @@ class Potential(nn.Module):
         """Return the untrained potential of an architecture that a file describes."""
         raise NotImplementedError(f"{cls.__name__} must define from_dict(), by which files are read.")
 
-    def network(self, is_kick: bool) -> NetworkLayer:
-        """Return the weights of a kick or drift of it for compiled loops; ValueError if there are none."""
-        raise NotCompiled(NO_NETWORK)
-
-    def trained(self) -> TrainedNetwork | None:
-        """Return the network for compiled derivatives by its parameters; None if there are none."""
-        return None
-
 
 class MLPPotential(Potential):
     """V(t, x) = c · N(t/τ, x/s), N a multilayer perceptron of any depth whose input is x with t appended.
@@ -495,6 +485,7 @@ class MLPPotential(Potential):
         return K, k, list(self.biases), list(self.weights), w
 
     def network(self, is_kick: bool) -> NetworkLayer:
+        """Return the weights of a kick or drift of it for compiled loops; NotCompiled if these cannot be."""
         from sympflow.kernels.networks import NetworkLayer
 
         if self.features:
@@ -512,6 +503,7 @@ class MLPPotential(Potential):
         return NetworkLayer(*first, biases, weights, array(w), self._sigma.compiled)
 
     def trained(self) -> TrainedNetwork | None:
+        """Return the network for compiled derivatives by its parameters; None if there are none."""
         from sympflow.kernels.activations import SLOPES
         from sympflow.kernels.network_tangents import TrainedNetwork
 

@@ -106,6 +106,9 @@ class Provenance:
         driven = _intervals(record.get("drive_times", []), "times of its drive")
         if len(driven) > 1 or any(low >= high for low, high in driven):
             raise Refused("its times of the drive are not one interval")
+        texts = record.get("lattice_terms", {})  # which are shown and never read
+        if not isinstance(texts, dict) or not all(isinstance(text, str) for text in texts.values()):
+            raise Refused("its terms of a lattice are not a table of texts")
         return cls(
             domain,
             system,
@@ -116,7 +119,7 @@ class Provenance:
             identity,
             unfitted,
             driven[0] if driven else None,
-            _texts(record.get("lattice_terms", {})),
+            texts,
         )
 
 
@@ -262,13 +265,6 @@ def _intervals(pairs: Any, what: str) -> tuple[tuple[float, float], ...]:
     if not all(_is_number(v) for pair in pairs for v in pair):
         raise Refused(f"its {what} are not numbers")
     return tuple((float(low), float(high)) for low, high in pairs)
-
-
-def _texts(table: Any) -> dict[str, str]:
-    """Return a table of texts in a record, which are shown and never read; else it is refused."""
-    if not isinstance(table, dict) or not all(isinstance(text, str) for text in table.values()):
-        raise Refused("its terms of a lattice are not a table of texts")
-    return table
 
 
 def _check_system(name: Any, fingerprint: Any, ndof: int) -> None:

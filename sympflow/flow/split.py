@@ -203,16 +203,12 @@ class SplitFlow(SystemFlow):
             t = t.to(self.dtype)
         return self._assemble(lambda column: column.values(t), lambda entries: torch.stack(entries, dim=-1))
 
-    def numpy_maps(self, t: np.ndarray) -> list[SubFlow]:
-        """The same of an array of times, for the compiled loops; for t < 0 the inverse of ψ̄_|t| (one sign for all)."""
-        t = np.asarray(t, dtype=float)
-        return self.frozen().maps(float(t)) if t.ndim == 0 else self._numpy_maps(t)
-
     def frozen(self) -> KeptMaps:
         """Return the maps of the numbers that the flow has now."""
         return self._maps.current(lambda: KeptMaps(self._numpy_maps, self._coefficient_maps(), self.dt))
 
     def _numpy_maps(self, t: np.ndarray) -> list[SubFlow]:
+        """The same of an array of times, for the compiled loops; for t < 0 the inverse of ψ̄_|t| (one sign for all)."""
         maps = self._assemble(
             lambda column: np.moveaxis(column.at(np.abs(t)), -1, 0), lambda entries: np.stack(entries, axis=-1)
         )

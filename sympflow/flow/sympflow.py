@@ -14,9 +14,10 @@ from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
 from sympflow.arguments import plain, real_number
+from sympflow.compiler import NotCompiled
 from sympflow.flow.families import family
 from sympflow.flow.flow_map import FlowMap
-from sympflow.flow.layers import LAYERS, Binding, Drift, Kick, Layer
+from sympflow.flow.layers import LAYERS, Binding, Drift, Kick, Layer, PotentialLayer
 from sympflow.flow.potentials import (
     MLPPotential,
     Potential,
@@ -555,17 +556,28 @@ class SympFlow(FlowMap):
     def _compiled(self) -> MLPFlowKernel:
         from sympflow.kernels.networks import MLPFlowKernel
 
-        networks = [layer.network() for layer in self.layers]  # type: ignore[operator]
+        if not (potentials := self._potentials()):
+            raise NotCompiled("`flow` has layers other than kicks and drifts with MLP potentials: use backend='array'.")
+        networks = [V.network(is_kick) for is_kick, V in potentials]
         check_compilable(self.dtype, self.device)
         return MLPFlowKernel(self.ndof, networks)
 
     def tangents(self) -> NetworkTangents | None:
         from sympflow.kernels.network_tangents import NetworkTangents
 
-        networks = [layer.trained() for layer in self.layers]  # type: ignore[operator]
-        if None in networks or len({(n.inputs, n.widths, n.activation) for n in networks}) > 1:
+        potentials = self._potentials()
+        networks = [network for _, V in potentials if (network := V.trained()) is not None]
+        alike = len({(n.inputs, n.widths, n.activation) for n in networks}) == 1
+        if not alike or len(networks) < len(potentials):
             return None
-        return NetworkTangents(self.ndof, [layer.kind == "kick" for layer in self.layers], networks)
+        return NetworkTangents(self.ndof, [is_kick for is_kick, _ in potentials], networks)
+
+    def _potentials(self) -> list[tuple[bool, MLPPotential]]:
+        """The potentials of its kicks, with True, and drifts; none where a layer is of another kind."""
+        layers: list[Any] = list(self.layers)
+        if not all(isinstance(x, PotentialLayer) and isinstance(x.potential, MLPPotential) for x in layers):
+            return []
+        return [(layer.kind == "kick", layer.potential) for layer in layers]
 
     def step_constants(self, x: Tensor, *t0: Tensor) -> Tensor:
         """The constants of a step from states (N, 2d) that its networks take beside these and t: (m, N)."""

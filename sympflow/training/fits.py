@@ -209,14 +209,6 @@ SOLVERS: dict[str, type[Solver]] = {cls.name: cls for cls in (Adam, BFGS, LBFGS,
 """The solvers by the names that the keyword `optimizer` takes."""
 
 
-def _checksum(data: Data) -> str:
-    """The checksum of labels."""
-    content = hashlib.sha256()
-    for array in data:
-        content.update(np.ascontiguousarray(array).tobytes())
-    return content.hexdigest()
-
-
 # fits -----------------------------------------------------------------------------------------------------------
 
 
@@ -288,7 +280,11 @@ class _LossFit(Fit):
     data: Data | None = field(default=None, repr=False, compare=False)
 
     def record(self, solver: Solver) -> dict[str, Any]:
-        return super().record(solver) | ({} if self.data is None else {"data": _checksum(self.data)})
+        told = super().record(solver)
+        if self.data is not None:
+            content = b"".join(np.ascontiguousarray(array).tobytes() for array in self.data)
+            told["data"] = hashlib.sha256(content).hexdigest()
+        return told
 
     def _named(self, loss: Any) -> dict[str, Any]:
         """The weights of the losses that are named, 0 for those that are left out."""

@@ -257,7 +257,7 @@ class SplitProblem(Problem):
     def differences(self, j: int) -> np.ndarray:
         """ψ̄_t(x) − φ_H,t(x) in modes, at the held-out states and the j-th of their times: (N, 2d)."""
         t, z = self.held_out.t, self._modes(self.held_out.x)
-        return self.kernel.step_modes(self.flow.numpy_maps(np.array(t[j])), z) - self._modes(self.held_out.y[j])
+        return self.kernel.step_modes(self.flow.frozen().maps(float(t[j])), z) - self._modes(self.held_out.y[j])
 
     def missed(self) -> tuple[float, float]:
         """See `shares_missed`: at the last of the held-out times, which is next to Δt."""

@@ -126,7 +126,9 @@ class TableRun(SearchRun):
             rest = options.label_weight if data is not None else 0.0
             loss = Loss(system, scaling, options.residual_weight, options.matching_weight, rest)
             shape = (flow.dt, options.loss_points, options.matching_times, options.seed, flow.dtype, flow.device)
-            points_at = PointSource(domain, *shape, block=1)(0)._replace(labels=_tensors(data) if rest else None)
+            points_at = PointSource(domain, *shape, block=1)(0)
+            if rest:
+                points_at = points_at._replace(labels=tuple(torch.as_tensor(a, dtype=torch.float64) for a in data))
             parts.append((1.0, LossProblem(table, Objective(loss, flow, points_at))))
         t = np.append(flow.dt * (np.arange(fractions) + 0.5) / fractions, flow.dt)
         unseen = system, domain, options.reference_states, options.seed, Stream.REFERENCE, t
@@ -350,10 +352,6 @@ def _distinct(minima: list[Minimum]) -> list[Minimum]:
         if not kept or m.cost > 1.01 * kept[-1].cost:
             kept.append(m)
     return kept
-
-
-def _tensors(data: tuple[np.ndarray, ...] | None) -> Any:
-    return None if data is None else tuple(torch.as_tensor(a, dtype=torch.float64) for a in data)
 
 
 # least squares ------------------------------------------------------------------------------------------------------

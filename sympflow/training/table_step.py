@@ -122,10 +122,6 @@ class TableStep:
         mean, end = self._friction.drift(p.swapaxes(-1, -2), s[:, None])
         return self._velocity(mean.swapaxes(-1, -2)), end.swapaxes(-1, -2)
 
-    def _slowing(self, p: np.ndarray) -> np.ndarray:
-        """−Γp of momenta (d, P), their rate in a drift."""
-        return np.zeros_like(p) if not self._friction else self._friction.force(p.T).T
-
     def errors(self, *given: Any) -> LabelErrors | ArrayErrors:
         """Weighted errors of labels after a step: see `LabelErrors`."""
         return ArrayErrors(self, *given) if self.loops is None else self.loops.errors(*given)
@@ -145,7 +141,8 @@ class TableStep:
                 change, p = self._drifted(p, c[i])
                 q = q + change
                 by_q[i] += self._velocity(p)
-                by_p[i] += self._slowing(p)
+                if self._friction:
+                    by_p[i] += self._friction.force(p.T).T
                 moved.append(i)
             else:
                 forces, changes = self._changes(q, by_q[moved])
