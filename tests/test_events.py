@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 
 from sympflow import HamiltonianSystem, SympFlow, get, solve, systems
 from sympflow.integrators.contract import FINISHED, Integrator, Outcome
-from sympflow.integrators.interpolants import Piecewise, hermite
+from sympflow.integrators.interpolants import Interpolant, Piecewise
 from sympflow.integrators.tableaux import ADAPTIVE as TORCHDIFFEQ_ADAPTIVE
 from sympflow.kernels.explicit_loops import compiled_field
 
@@ -279,7 +279,8 @@ class Unwatched(Integrator):
         t = np.linspace(problem.t0, problem.t1, 1 + round(2 * abs(problem.t1 - problem.t0)))
         y = np.stack([np.cos(t), -np.sin(t)], axis=-1)
         f = np.stack([y[:, 1], -y[:, 0]], axis=-1)
-        steps = [hermite(t[k], t[k + 1], y[k], y[k + 1], f[k], f[k + 1]) for k in range(len(t) - 1)]
+        ends = [((y[k], y[k + 1]), (f[k], f[k + 1])) for k in range(len(t) - 1)]
+        steps = [Interpolant(t[k], t[k + 1], y[k], lambda k=k: ends[k]) for k in range(len(ends))]
         sol = Piecewise(steps, problem.y0, problem.t0, problem.t1) if self.dense else None
         return Outcome(t, y, 0, FINISHED, {"force_evaluations": 0}, sol)
 

@@ -123,10 +123,18 @@ class FixedStep(Integrator):
         )
         return states, finite, library_name(problem.y0)
 
+    def on_clock(self, system: HamiltonianSystem) -> Any:
+        """Return the method on its clock, where that is not the physical one."""
+        return None
+
     def run(self, problem: Problem) -> Outcome:
-        return grid_run(self, problem).outcome()
+        clock = self.on_clock(problem.system)
+        return grid_run(self, problem).outcome() if clock is None else clock.run(problem)
 
     def steps(self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array) -> Steps:
+        if (clock := self.on_clock(system)) is not None:
+            yield from clock.steps(t_span, y0)
+            return
         stepper, chunk, y = self.stepper(Problem(system, *t_span, y0)), 256, y0
         for piece in pieces_of(self, system, *t_span):
             grid, k = Grid(*piece, self.step_length(system)), 0

@@ -498,9 +498,3 @@ class LogSympFlow(FixedStep):
 
     def tangent(self, system: HamiltonianSystem, t: float, y: Array, h: Array) -> tuple[np.ndarray, np.ndarray]:
         return self.on_clock(system).tangent(y, h)
-
-    def run(self, problem: Problem) -> Outcome:
-        return self.on_clock(problem.system).run(problem)
-
-    def steps(self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array) -> Steps:
-        return self.on_clock(system).steps(t_span, y0)

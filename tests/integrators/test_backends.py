@@ -10,7 +10,7 @@ from sympflow.integrators.steppers import compiled_loops
 from sympflow.schemes import SCHEMES
 
 HH = systems.henon_heiles()
-PLAIN = HamiltonianSystem(lambda q: (np.sort(q) ** 4).sum(-1), ndof=1, y0=[1.0, 0.0], gradient=lambda q: 4 * q**3)
+PLAIN = HamiltonianSystem(lambda q: (np.unwrap(q) ** 4).sum(-1), ndof=1, y0=[1.0, 0.0], gradient=lambda q: 4 * q**3)
 TRACED = HamiltonianSystem(lambda q: (q**4).sum(-1), ndof=1, y0=[1.0, 0.0])
 AIRY = HamiltonianSystem.from_sympy("p**2/2 - airyai(q)", y0=[1.0, 0.0])
 
@@ -51,7 +51,7 @@ def test_the_compiled_count_merges_the_last_kick_with_the_next_first():
         (HH, {"y0": torch.tensor(HH.y0), "backend": "array"}, "torch"),
         (HH, {"backend": "array"}, "numpy"),
         (TRACED, {}, "compiled"),
-        (PLAIN, {}, "numpy: `potential` could not be traced, for numpy.sort has no rule"),
+        (PLAIN, {}, "numpy: `potential` could not be traced, for numpy.unwrap has no rule"),
         (AIRY, {}, "numpy"),
     ],
 )
@@ -69,7 +69,7 @@ def test_auto_chooses_what_applies(system, arguments, backend):
             {"backend": "compiled", "y0": torch.tensor(HH.y0, requires_grad=True), "method": "tao4"},
             r"^`backend` 'compiled' .* `y0` ",
         ),
-        (PLAIN, {"backend": "compiled"}, r"^`backend` 'compiled' .* functions could not be traced: numpy\.sort"),
+        (PLAIN, {"backend": "compiled"}, r"^`backend` 'compiled' .* functions could not be traced: numpy\.unwrap"),
         (AIRY, {"backend": "compiled"}, r"^`backend` 'compiled' does not apply"),
         (PLAIN, {"compensated": True}, r"^`compensated` sums need compiled loops"),
         (HH, {"backend": "array", "compensated": True}, r"^`compensated` sums need compiled loops"),
