@@ -4,6 +4,7 @@ The public names are loaded when first used (PEP 562): importing sympflow loads 
 """
 
 from importlib import import_module
+from types import FunctionType
 from typing import TYPE_CHECKING, Any
 
 from sympflow._version import __version__
@@ -177,6 +178,11 @@ def __getattr__(name: str) -> Any:
             hint = f". It is `sympflow.interop.{_OF_INTEROP[name]}.{name}`"
         raise AttributeError(f"module 'sympflow' has no attribute {name!r}{hint}")
     value = getattr(whole_import(f"sympflow.{_HOME[name]}"), name)
+    if isinstance(value, FunctionType):
+        from sympflow.arguments import told
+
+        value = told(value)
+        value.__module__ = __name__  # where pickles find it
     globals()[name] = value
     return value
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import inspect
 import math
 import os
 import reprlib
@@ -11,15 +12,18 @@ import tempfile
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from functools import wraps
 from math import isfinite
 from pathlib import Path
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from sympflow.arrays import differentiable, is_tensor, to_numpy, without_torch
 
+P = ParamSpec("P")
+T = TypeVar("T")
 MAX_SAVED_VALUES = 10_000_000
 MAX_ASKED_VALUES = 1_000_000_000  # values of a batch, or of outputs that were asked for one by one: 8 GB
 LONGEST_STEP = 1e100  # beyond it the powers of dt in a step are no floating-point numbers
@@ -316,10 +320,95 @@ def sample_count(n: int) -> int:
     return int(n)
 
 
+def closest(name: str, known: Iterable[str], cutoff: float = 0.6) -> str:
+    """The name that is closest to one, in any case of letters; "" where none is close."""
+    by_letters = {each.lower(): each for each in reversed(list(known))}
+    close = difflib.get_close_matches(name.lower(), by_letters, n=1, cutoff=cutoff)
+    return by_letters[close[0]] if close else ""
+
+
 def did_you_mean(name: str, known: Iterable[str], cutoff: float = 0.6) -> str:
     """A question after the name that is closest to one, with a space before it; "" where none is close."""
-    close = difflib.get_close_matches(name, list(known), n=1, cutoff=cutoff)
-    return f" Did you mean {close[0]!r}?" if close else ""
+    close = closest(name, known, cutoff)
+    return f" Did you mean {close!r}?" if close else ""
+
+
+OF_RUNS = ("t_span", "y0", "dt", "tol", "params", "t_eval", "dense_output", "save_every", "events", "store")
+INSTEAD = {
+    "args": "values of parameters are in H, or given by `params`",
+    **dict.fromkeys(("q0", "p0", "x0", "v0", "y_0", "ic", "u0"), "the initial state is `y0`, [q, p] in one array"),
+    **dict.fromkeys(("initial_state", "initial_conditions"), "the initial state is `y0`, [q, p] in one array"),
+    **dict.fromkeys(("h", "step", "step_size", "stepsize"), "the step of fixed-step methods is `dt`"),
+    **dict.fromkeys(("timestep", "time_step", "dt0", "delta_t"), "the step of fixed-step methods is `dt`"),
+    **dict.fromkeys(("n_steps", "num_steps", "steps"), "n steps over `t_span` are dt=(t1 - t0)/n"),
+    **dict.fromkeys(("t_end", "t1", "T", "tmax", "t_max", "t0", "duration"), "times are `t_span`, (start, end)"),
+    **dict.fromkeys(
+        ("t", "ts", "times", "saveat", "save_at"), "times of outputs are `t_eval`, or every few steps by `save_every`"
+    ),
+    **dict.fromkeys(("integrator", "solver", "algorithm", "scheme"), "the method is `method`"),
+    **dict.fromkeys(("abstol", "reltol"), "tolerances of adaptive methods are `rtol` and `atol`"),
+    **dict.fromkeys(("jac", "vectorized", "fun"), "leave it out: H tells the forces and their derivatives"),
+    **dict.fromkeys(("verbose", "progress_bar"), "a bar is `progress`"),
+    **dict.fromkeys(("n_jobs", "n_workers", "num_workers"), "sympflow.ensemble has `workers`"),
+    "dt": "steps to try are `steps`, and a method with one step is sympflow.get(name)(dt=...)",
+    "tol": "the step for a tolerance is that of sympflow.choose_step(system, method, tol)",
+    "plane": "the plane of a section is `coordinate` = `level`",
+    "E": "the energy of a section is `energy`",
+    "device": "pass `y0` as a tensor on that device",
+    "lr": "a learning rate is one of a solver, solver=sympflow.Adam(learning_rate=...)",
+    "epochs": "how long is `budget`, in seconds, or the steps of a solver, solver=sympflow.Adam(steps=...)",
+}
+"""Remedies for arguments by names that they have elsewhere."""
+
+
+def advice(name: str, known: Iterable[str]) -> str:
+    """The remedy for an argument that is not there, and the end of a sentence; "" if none is known."""
+    if name in INSTEAD:
+        return f"{INSTEAD[name]}."
+    close = closest(name, known)
+    return close and f"did you mean `{close}`?"
+
+
+def told(function: Callable[P, T]) -> Callable[P, T]:
+    """Decorate a function: a call that does not fit its arguments is told which there are."""
+
+    @wraps(function)
+    def call(*args: P.args, **options: P.kwargs) -> T:
+        try:
+            return function(*args, **options)
+        except TypeError as error:
+            if error.__traceback__ is None or error.__traceback__.tb_next is not None:
+                raise  # within the function
+        raise TypeError(_misfit(function, len(args), options))
+
+    return call
+
+
+def _misfit(function: Callable[..., Any], given: int, options: dict[str, Any]) -> str:
+    """The message for a call with so many arguments and these options, which the function does not take."""
+    parameters = inspect.signature(function).parameters
+    named = [p for p in parameters.values() if p.name != "self" and p.kind is not p.VAR_KEYWORD]
+    names, what = [p.name for p in named], f"{function.__name__}()"
+    more = any(p.kind is p.VAR_KEYWORD for p in parameters.values())
+    unknown = [] if more else [name for name in options if name not in parameters]
+    if unknown:
+        remedy = advice(unknown[0], names) or "remove it."
+        if function.__module__.startswith("sympflow.systems"):
+            remedy = "pass it to solve()." if unknown[0] in OF_RUNS else closest(unknown[0], names) and remedy
+            remedy = remedy or "write your own H with it, by HamiltonianSystem.from_sympy."
+        return f"`{unknown[0]}` is not an argument of {what}, which takes {', '.join(names) or 'none'}: {remedy}"
+    ordered = [p.name for p in named if p.kind is p.POSITIONAL_OR_KEYWORD]
+    given -= "self" in parameters
+    if given > len(ordered):
+        rest = [*names[len(ordered) :], *["name"] * more]
+        if not rest:
+            return f"`{function.__name__}` takes {', '.join(names) or 'no arguments'}: leave the others out."
+        after = f" after `{ordered[-1]}`" if ordered else ""
+        return f"arguments of {what}{after} are given by name: write {rest[0]}=value."
+    missing = [p.name for p in named if p.default is p.empty and p.name not in (*options, *ordered[:given])]
+    if missing:
+        return f"`{missing[0]}` is missing: give it, {function.__name__}({', '.join(ordered or missing)})."
+    return f"`{next(name for name in options if name in ordered)}` is given twice, by place and by name: name it once."
 
 
 def warn(message: str, category: type[Warning] = UserWarning) -> None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from sympflow.arguments import check_flag, warn
+from sympflow.arguments import check_flag, told, warn
 from sympflow.arrays import Array, concatenate, is_tensor, to_numpy
 from sympflow.hamiltonian.scales import known_scale, size_of_terms, weights
 from sympflow.integrators.contract import method_text
@@ -38,6 +38,16 @@ LARGE = 2_000_000  # numbers of a solution beyond which its card has no energy e
 LOOKED_AT = 64  # outputs at which the terms of H are looked at
 
 
+class NoOutput:
+    """The dense output of a run that was asked for none: it is false."""
+
+    def __bool__(self) -> bool:
+        return False
+
+    def __call__(self, t: Any) -> Array:
+        raise TypeError("`sol` is for runs with dense output: pass dense_output=True to solve(), or times as `t_eval`.")
+
+
 @dataclass(repr=False)
 class Solution(Answering):
     """The solution of an initial value problem, with SciPy's fields.
@@ -48,8 +58,9 @@ class Solution(Answering):
         Output times.
     y : ndarray or tensor of shape (..., 2d, n)
         States [q, p], time last, as in SciPy.
-    sol : callable or None
-        Dense output: sol(t) has shape (..., 2d) for a number t, (..., 2d, n) for an array.
+    sol : callable
+        Dense output: sol(t) has shape (..., 2d) for a number t, (..., 2d, n) for an array. It is false where none was
+        asked for.
     t_events, y_events : list of ndarray or None
         For each event its times (n,) and states (n, 2d), without gradient (`interop.torchdiffeq.odeint_event` gives
         that); None if no events were asked for.
@@ -74,6 +85,7 @@ class Solution(Answering):
 
     _OTHER_NAMES: ClassVar[Mapping[str, str]] = {
         **dict.fromkeys(("times", "time", "ts"), "`t`, the times of outputs"),
+        **dict.fromkeys(("q1", "q2", "p1", "p2"), "`q[..., i, :]` and `p[..., i, :]`, from i = 0"),
         **dict.fromkeys(("x", "ys", "u", "trajectory"), "`y`, of shape (..., 2d, n), or `q` and `p`"),
         **dict.fromkeys(("positions", "momenta", "v", "velocities"), "`q` and `p`, of shape (..., d, n)"),
         **dict.fromkeys(("q0", "p0"), "`y0`, the initial state [q, p]"),
@@ -81,7 +93,10 @@ class Solution(Answering):
         **dict.fromkeys(("error", "errors"), "`energy_error()`, or sympflow.reference_error(sol)"),
         **dict.fromkeys(("dt", "n_steps", "wall_time"), "`stats`, a dictionary that has it"),
         **dict.fromkeys(("method", "solver"), "`integrator`"),
-        **dict.fromkeys(("save", "to_csv"), "`to_dataframe()`, `to_xarray()` or `to_netcdf(path)`"),
+        **dict.fromkeys(
+            ("save", "to_csv", "to_pandas", "to_numpy"),
+            "`t` and `y`, `to_dataframe()`, `to_xarray()` or `to_netcdf(path)`",
+        ),
     }
     t: np.ndarray
     y: Array
@@ -96,6 +111,14 @@ class Solution(Answering):
     t_events: list[np.ndarray] | None = None
     y_events: list[np.ndarray] | None = None
     rows: ParameterRows | None = None
+
+    def __post_init__(self) -> None:
+        self.sol = self.sol or NoOutput()
+
+    def __getitem__(self, key: Any) -> Any:
+        raise TypeError(
+            f"`sol` has no item {key!r}: take `sol.t`, `sol.y`, `sol.q` or `sol.p`, as in t, y = sol.t, sol.y."
+        )
 
     @property
     def nfev(self) -> int:
@@ -232,6 +255,7 @@ class Solution(Answering):
     def preview(self) -> Figure | None:
         return self.plot() if len(self.t) and not isinstance(self, StoredSolution) else None
 
+    @told
     def plot(self, kinds: Sequence[str] = KINDS, path: str | os.PathLike[str] | None = None) -> Figure:
         """Draw the orbit, the phase plane and the energy error over time, of 16 trajectories of a batch at most.
 
@@ -418,7 +442,7 @@ def physical_solution(sol: Solution) -> Solution:
         system=doubled.physical,
         y0=limit(sol.y0),
         stats={**sol.stats, "difference": float(apart)},
-        sol=None if sol.sol is None else Mapped(sol.sol, limit),
+        sol=sol.sol and Mapped(sol.sol, limit),
         y_events=None if sol.y_events is None else [limit(y) for y in sol.y_events],
     )
 
@@ -483,7 +507,7 @@ def joined(
                 f"`t_eval` is needed: method {first.integrator.name!r} chooses its steps for each value of the "
                 "parameters, so that their outputs are at other times."
             )
-    dense = None if first.sol is None else Joined([(i, part.sol) for i, part in pieces if part.sol], rows.shape)
+    dense = first.sol and Joined([(i, part.sol) for i, part in pieces if part.sol], rows.shape)
     status = _scattered([(i, np.asarray(part.status)) for i, part in pieces], rows.shape)
     bad = [(i[np.asarray(part.status) < 0], part) for i, part in pieces if not part.success]
     message = first.message

@@ -1,11 +1,14 @@
 """Natural first calls: what is meant is done, or the error names the remedy."""
 
 import importlib
+import math
+import pickle
 import warnings
 
 import numpy as np
 import pytest
 import sympy as sp
+from scipy.special import ellipk
 from sympy.physics.mechanics import dynamicsymbols
 
 import sympflow
@@ -76,6 +79,10 @@ def test_functions_of_the_time_are_coordinates():
     assert H(pr**2 / 2 + k / r, q=[r], p=[pr], params={k: 2}).expression == H("p**2/2 + 2/q").expression
 
 
+def ran():
+    return solve(SPRING, "verlet", (0, 1), [1, 0], dt=0.1)
+
+
 ANSWERED = {
     "lambda": (lambda: solve(lambda q, p: p**2), TypeError, r"`system` .* HamiltonianSystem\(hamiltonian=f, ndof=d\)"),
     "factory": (lambda: solve(systems.pendulum), TypeError, r"`system` .* call it, pendulum\(\)"),
@@ -136,6 +143,49 @@ ANSWERED = {
     "an event of y": (lambda: solve(SPRING, y0=[1, 0], events=lambda y: y), TypeError, r"Write g\(t, y\)"),
     "Tsit5": (lambda: sympflow.get("Tsit5"), ValueError, "'dop853'"),
     "symplectic": (lambda: sympflow.get("symplectic"), ValueError, "'srkn11b', or 'kahan_li8'"),
+    "no dense output": (lambda: ran().sol(3), TypeError, "`sol` is for runs with dense output: pass dense_output=True"),
+    "sol[0]": (lambda: ran()[0], TypeError, r"`sol` has no item 0: take `sol.t`, `sol.y`"),
+    "t, y = sol": (lambda: list(ran()), TypeError, r"as in t, y = sol.t, sol.y"),
+    "sol.q1": (lambda: ran().q1, AttributeError, r"'q1': take `q\[..., i, :\]`"),
+    "plot(kind=)": (lambda: ran().plot(kind="phase"), TypeError, r"`kind` .* of plot\(\).*: did you mean `kinds`\?"),
+    "no system": (
+        lambda: solve(t_span=(0, 1)),
+        TypeError,
+        r"`system` is missing: give it, solve\(system, method, t_span",
+    ),
+    "dt by place": (lambda: solve(SPRING, "verlet", (0, 1), [1, 0], 0.1), TypeError, r"after `y0` are given by name"),
+    "y0 twice": (lambda: solve(SPRING, "verlet", (0, 1), [1, 0], y0=[1, 0]), TypeError, "`y0` is given twice"),
+    "no tol": (lambda: sympflow.choose_step(SPRING, "verlet"), TypeError, "`tol` is missing: give it, choose_step"),
+    "compare(tol=)": (lambda: sympflow.compare(SPRING, ["verlet"], tol=1), TypeError, "`tol` .*sympflow.choose_step"),
+    "repeat": (lambda: sympflow.compare(SPRING, ["verlet"], repeat=1), TypeError, "did you mean `repeats`"),
+    "with_params of a dict": (lambda: H(SPRING).with_params({"k": 1}), TypeError, r"with_params\(\) are given by name"),
+    "force of a number": (
+        lambda: H(SPRING).force(1.0),
+        TypeError,
+        r"`q` must be an array or a tensor, positions; got 1.0",
+    ),
+    "H of a solution": (lambda: H(SPRING).hamiltonian(ran()), TypeError, "got Solution: pass .*`sol.states`"),
+    "H of sol.y": (lambda: H(SPRING).hamiltonian(ran().y), ValueError, "Of a solution pass `sol.states`"),
+    "kepler(mu=)": (lambda: systems.kepler(mu=2), TypeError, r"`mu` .*kepler\(\), which takes e: write your own H"),
+    "fput_beta(N=)": (lambda: systems.fput_beta(N=9), TypeError, "`N` .* takes n, beta, amplitude: did you mean `n`"),
+    "pendulum(dt=)": (lambda: systems.pendulum(dt=0.1), TypeError, r"which takes none: pass it to solve\(\)"),
+    "pendulum(1)": (lambda: systems.pendulum(1), TypeError, "`pendulum` takes no arguments: leave the others out"),
+    "dt0": (lambda: solve(SPRING, "verlet", y0=[1, 0], dt0=1), TypeError, "the step of fixed-step methods is `dt`"),
+    "tspan": (lambda: solve(SPRING, "verlet", y0=[1, 0], tspan=1), TypeError, "did you mean `t_span`"),
+    "abstol": (lambda: solve(SPRING, "rk45", y0=[1, 0], abstol=1), TypeError, "are `rtol` and `atol`"),
+    "dt of rk45": (lambda: solve(SPRING, "rk45", y0=[1, 0], dt=1), TypeError, "chooses its own steps: give `rtol`"),
+    "flow=": (lambda: solve(SPRING, "verlet", y0=[1, 0], flow=1), TypeError, "is given in the place of a method"),
+    "n_workers": (lambda: solve(SPRING, y0=[1, 0], n_workers=2), TypeError, "sympflow.ensemble has `workers`"),
+    "epochs": (
+        lambda: sympflow.train("pendulum", epochs=3),
+        TypeError,
+        r"`budget`, in seconds, .*Adam\(steps=\.\.\.\)",
+    ),
+    "from_sympy(V=)": (lambda: H(SPRING, V=1), TypeError, "a potential is `potential`"),
+    "from_sympy(k=)": (lambda: H("p**2/2 + k*q**2", k=1), TypeError, "values of symbols are `params`"),
+    "from_sympy(tspan=)": (lambda: H(SPRING, tspan=1), TypeError, "did you mean `t_span`"),
+    "any case": (lambda: systems.Kepler, AttributeError, "Did you mean 'kepler'"),
+    "system.train": (lambda: H(SPRING).train, AttributeError, r"take sympflow.train\(system\)"),
     "scene": (lambda: systems.henon, AttributeError, "Did you mean 'henon_heiles'"),
 }
 
@@ -144,6 +194,26 @@ ANSWERED = {
 def test_the_answer_names_the_remedy(call, kind, answer):
     with pytest.raises(kind, match=answer):
         call()
+
+
+def test_a_solution_without_dense_output_has_a_false_one():
+    assert not ran().sol
+    assert solve(SPRING, "verlet", (0, 1), [1, 0], dt=0.1, dense_output=True).sol
+
+
+@pytest.mark.parametrize("function", [solve, systems.kepler, sympflow.lyapunov])
+def test_functions_are_pickled_by_name(function):
+    assert pickle.loads(pickle.dumps(function)) is function
+
+
+@pytest.mark.parametrize("end", [100, math.inf])
+def test_a_tolerance_chooses_the_step_of_a_run_that_an_event_ends(end):
+    def turns(t, y):
+        return y[1]
+
+    turns.terminal, turns.direction = True, 1
+    sol = solve("pendulum", "srkn11b", (0, end), [1.0, 0.0], events=turns, tol=1e-12)
+    np.testing.assert_allclose(sol.t_events[0], 2 * ellipk(np.sin(0.5) ** 2), rtol=1e-12)
 
 
 def test_states_in_the_place_of_times_are_told():

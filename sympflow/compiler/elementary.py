@@ -25,7 +25,7 @@ from typing import Any
 from numpy.polynomial import Polynomial
 
 from sympflow.compiler.control import DOUBLE, LOWERED, Type, Value
-from sympflow.compiler.functions import MOST_DERIVATIVES, OF_SCIPY, SPECIAL, fma, where
+from sympflow.compiler.functions import COMPOSED, MOST_DERIVATIVES, OF_SCIPY, SPECIAL, fma, where
 
 __all__ = ["LOWERED"]
 
@@ -512,6 +512,9 @@ def _by_scipy(*args: Value, name: str) -> Value:
 for _name in OF_SCIPY:
     _lowered(_name, inline=0)(partial(_by_scipy, name=_name))
 
+
+for _name, (_value, _) in COMPOSED.items():
+    _lowered(_name)(_value)
 
 # the derivatives of ln Γ, which C has not: Abramowitz and Stegun (1964), 6.3.18 and 6.4.11 from 16 on, below by
 # recurrence, below 1/2 by reflection --------------------------------------------------------------------------------

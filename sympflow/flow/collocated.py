@@ -133,7 +133,12 @@ class CollocatedFlow(SystemFlow):
                     "`steps` is needed, for the system has no domain over which errors could be compared: give it, or "
                     "`states`."
                 )
-            steps = enough_steps(system, flow.tableau, flow.dt, _checked_states(states, system.ndof))
+            x, width = floats("states", states), 2 * system.ndof
+            if x.ndim != 2 or x.shape[1] != width or not len(x) or not np.isfinite(x).all():
+                raise ValueError(
+                    f"`states` must be finite and of shape (n, {width}); got {x.shape}: give some, or `steps`."
+                )
+            steps = enough_steps(system, flow.tableau, flow.dt, x)
         made = cls(system.ndof, stages, steps, system=system, **like)
         made.domain = system.domain
         if system.domain is not None:
@@ -178,13 +183,6 @@ class CollocatedFlow(SystemFlow):
     def bound_system(self) -> HamiltonianSystem:
         """The system whose H the flow uses."""
         return self._binding.system
-
-
-def _checked_states(states: ArrayLike, ndof: int) -> np.ndarray:
-    x = floats("states", states)
-    if x.ndim != 2 or x.shape[1] != 2 * ndof or not len(x) or not np.isfinite(x).all():
-        raise ValueError(f"`states` must be finite and of shape (n, {2 * ndof}); got {x.shape}: give some, or `steps`.")
-    return x
 
 
 @np.errstate(all="ignore")  # of steps that are too long

@@ -47,10 +47,6 @@ def at_dt(dt: float, t: Any) -> Any:
     return abs(abs(t) - dt) <= AT_DT * dt
 
 
-def _is_period(value: Any) -> bool:
-    return isinstance(value, float) and 0 < value < math.inf
-
-
 def processor_of(kicks: Sequence[float], gradients: Sequence[float]) -> Substeps:
     """χ of kicks β_j and force gradients γ_j, in units of a step."""
     reach = len(kicks) // 2
@@ -220,9 +216,10 @@ class KeplerFlow(SystemFlow):
     @classmethod
     def checked_plan(cls, plan: dict[str, Any], ndof: int) -> dict[str, Any]:
         reach = checked_integer(plan.get("reach"), "reach", MOST_REACH)
-        gradients, periods = plan.get("gradients"), plan.get("periods")
+        gradients, periods = plan.get("gradients"), plan.get("periods", ())
         if gradients != 0:
             gradients = checked_integer(gradients, "number of force gradients", 2 * reach)
-        if not (isinstance(periods, list) and len(periods) == ndof // 3 - 1 and all(map(_is_period, periods))):
+        known = isinstance(periods, list) and all(isinstance(p, float) and 0 < p < math.inf for p in periods)
+        if not known or len(periods) != ndof // 3 - 1:
             raise Refused("its periods are not those of its planets")
         return {"reach": reach, "n_gradients": gradients, "periods": periods}

@@ -102,7 +102,10 @@ class PrimedFlow(PrimedKnown, SystemFlow):
             )
         exponents = _monomials_of(system, polynomial, force_gradient, curvature)
         force_gradient = _force_gradient_of(system, False if exponents else force_gradient, curvature)
-        _check_counts(stages, processor)
+        for name, value in (("stages", stages), ("processor", processor)):
+            if isinstance(value, int) and 2 * value + 1 > MAX_LAYERS:
+                most = (MAX_LAYERS - 1) // 2
+                raise ValueError(f"`{name}` must be at most {most}, as many as a file may hold; got {value!r}.")
         scheme = _starting_scheme(system, scheme, stages, first)
         if palindromic and not scheme.symmetric:
             raise ValueError(f"`scheme` {scheme.name!r} is not symmetric: take another, or palindromic=False.")
@@ -322,14 +325,6 @@ class PrimedFlow(PrimedKnown, SystemFlow):
     def initial_velocity(self, x: Tensor, t0: Any = None) -> Tensor:
         """d/dt ψ̄_t(x) at t = 0: that of its system, as the coefficients of V and T sum up to 1."""
         return super().initial_velocity(x, t0) if self.system is None else self.system.vector_field(x, t0)
-
-
-def _check_counts(stages: Any, processor: Any) -> None:
-    """Raise ValueError where there are more maps than a file may hold."""
-    for name, value in (("stages", stages), ("processor", processor)):
-        if isinstance(value, int) and 2 * value + 1 > MAX_LAYERS:
-            most = (MAX_LAYERS - 1) // 2
-            raise ValueError(f"`{name}` must be at most {most}, as many as a file may hold; got {value!r}.")
 
 
 def _starting_scheme(system: HamiltonianSystem, scheme: Any, stages: Any, first: str) -> Scheme:

@@ -98,7 +98,11 @@ class Provenance:
         for name, value in record["figures"].items():
             if value is not None and not _is_number(value):
                 raise Refused(f"its figures have a {name} that is neither a number nor None: {value!r}")
-        certificate, identity = _certificate(record), _identity(record, ndof)
+        identity, certificate = _identity(record, ndof), None
+        if record.get("certificate") is not None:
+            certificate = _made("certificate", Certificate.from_dict, record["certificate"])
+            if certificate.weights != record.get("checksum"):
+                raise Refused("its certificate is one of other weights")
         domain = None if record["domain"] is None else _domain(record["domain"], ndof)
         if fingerprint is not None:
             fingerprint = tuple(math.nan if v is None else float(v) for v in fingerprint)
@@ -240,16 +244,6 @@ def _made(what: str, make: Callable[..., T], *given: Any) -> T:
         return make(*given)
     except (ValueError, TypeError, AttributeError) as error:
         raise Refused(f"its {what} is not admissible ({error})") from None
-
-
-def _certificate(record: dict[str, Any]) -> Certificate | None:
-    """Return the certificate in the record, if there is one; it must be of the weights that the file holds."""
-    if record.get("certificate") is None:
-        return None
-    certificate = _made("certificate", Certificate.from_dict, record["certificate"])
-    if certificate.weights != record.get("checksum"):
-        raise Refused("its certificate is one of other weights")
-    return certificate
 
 
 def _identity(record: dict[str, Any], ndof: int) -> Identity | None:

@@ -33,7 +33,7 @@ from sympflow.arrays import (
 )
 from sympflow.compiler.tracing import WEIGHTS, Untraceable, trace, trace_chain
 from sympflow.hamiltonian.definition import Definition
-from sympflow.hamiltonian.formulas import TracedHamiltonian, TracedPoles
+from sympflow.hamiltonian.formulas import TracedHamiltonian, TracedPoles, without_overflow
 from sympflow.hamiltonian.function_checks import Tested, check_writes, probe_states, test
 from sympflow.hamiltonian.layered import LayeredPotential
 from sympflow.hamiltonian.times import probe_times
@@ -164,7 +164,7 @@ class CallableHamiltonian(Definition):
         values, f = self._values(states, times), self._given_function
         d = self.ndof
         names: list[Any] = [[f"{letter}{i + 1}" for i in range(d)] for letter in "qp"[: 2 - self.separable]]
-        program = trace(f, ["t", *names] if self.timed else names, self.library == "torch")
+        program = without_overflow(trace(f, ["t", *names] if self.timed else names, self.library == "torch"))
         form = TracedHamiltonian(d, program, self.separable, inverse_mass, self.timed)
         at = (np.array(times),) if self.timed else ()
         x = states[:, :d] if self.separable else states

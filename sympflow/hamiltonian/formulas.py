@@ -495,3 +495,26 @@ def recorded(expressions: Sequence[Any], inputs: Sequence[Any]) -> Program:
         return list(map(evaluator(dict(zip(inputs, numbers, strict=True))), expressions))
 
     return traced(values, *(s.name for s in inputs))
+
+
+def without_overflow(program: Program) -> Program:
+    """The program; one that divides by exponentials, or takes their logarithm, by functions that do not overflow."""
+    large, divides = set[int](), False
+    for x in program.operations:
+        deep = [isinstance(a, Traced) and a.order in large for a in x.args]
+        if any(deep) or x.name in ("exp", "cosh", "sinh"):
+            large.add(x.order)
+        inverse = x.name == "pow" and isinstance(x.args[1], float) and x.args[1] < 0
+        divides |= deep[-1] if x.name == "div" else (inverse or x.name in ("log", "log1p")) and deep[0]
+    if divides and len(program) <= MOST_IN_SYMBOLS:
+        import sympy as sp
+
+        from sympflow.hamiltonian.recorded import NotRecorded, in_symbols
+        from sympflow.hamiltonian.removable import with_own_functions
+
+        with suppress(NotRecorded, ValueError, TypeError):
+            f = in_symbols(program)
+            written = with_own_functions(f)
+            if written != f:
+                return recorded([written], [sp.Symbol(repr(x), real=True) for x in program.inputs])
+    return program

@@ -13,6 +13,7 @@ from sympflow.hamiltonian.definition import bare_copy
 from sympflow.hamiltonian.formulas import TracedHamiltonian, recorded
 from sympflow.hamiltonian.friction import FRICTIONLESS, Friction
 from sympflow.hamiltonian.times import checked_time
+from sympflow.show.cards import Shown
 
 if TYPE_CHECKING:
     from sympflow.compiler.program import Program
@@ -22,6 +23,16 @@ if TYPE_CHECKING:
 
 
 NEWTON, FOUND = 20, 1e-12  # steps at most, and the error of a velocity relative to the largest
+
+
+def _check_array(name: str, x: Any, what: str) -> None:
+    """Raise a TypeError for what is no array."""
+    if isinstance(x, list | tuple | int | float | str | dict | Shown) and not isinstance(x, np.generic):
+        given = type(x).__name__ if isinstance(x, Shown) else repr(x)
+        raise TypeError(
+            f"`{name}` must be an array or a tensor, {what}; got {given}: pass np.array([...]), or `sol.states` of a "
+            "solution."
+        )
 
 
 class Hamiltonian:
@@ -303,12 +314,11 @@ class Hamiltonian:
         return self.vector_field(y, t)
 
     def _check_width(self, y: Array) -> None:
-        if isinstance(y, list | tuple | int | float):
-            raise TypeError(f"`y` must be an array or a tensor, a state [q, p]; got {y!r}: pass np.array([q, p]).")
+        _check_array("y", y, "a state [q, p]")
         if y.shape[-1:] != (2 * self.ndof,):
             raise ValueError(
-                f"`y` must have shape (..., {2 * self.ndof}), [q, p] on the last axis; got {tuple(y.shape)}. In "
-                "solve_ivp leave `vectorized` out, which asks for states in columns."
+                f"`y` must have shape (..., {2 * self.ndof}), [q, p] on the last axis; got {tuple(y.shape)}. Of a "
+                "solution pass `sol.states`; in solve_ivp leave `vectorized` out, which asks for states in columns."
             )
 
     # separable systems: V(q) and T(p) -------------------------------------------------------------
@@ -374,6 +384,7 @@ class Hamiltonian:
         return self
 
     def _positions(self, q: Array) -> Array:
+        _check_array("q", q, "positions")
         if q.shape[-1:] != (self.ndof,):
             raise ValueError(
                 f"`q` must have shape (..., {self.ndof}), positions on the last axis; got {tuple(q.shape)}: "

@@ -47,19 +47,19 @@ class Border:
         return set().union(self.g.free_symbols, *(f.free_symbols for f in (*self.above, *self.below)))
 
 
-_STEPS = (sp.Heaviside, sp.sign, sp.Abs, sp.acot, sp.atan2, sp.floor, sp.Max, sp.Min, triangle)
+_STEPS = (sp.Heaviside, sp.sign, sp.Abs, sp.acot, sp.atan2, sp.floor)
+_KINKS = (sp.Max, sp.Min, triangle)
 
 
-def borders(f: sp.Expr, symbols: Iterable[sp.Symbol]) -> list[Border]:
-    """The borders across which an expression may jump and whose g depends on some symbols, Abs and kinks among them."""
+def borders(f: sp.Expr, symbols: Iterable[sp.Symbol], kinks: bool = False) -> list[Border]:
+    """The borders across which an expression may jump and whose g depends on some symbols, or has `kinks`."""
     wanted = set(symbols)
     if f.has(sp.ceiling, sp.frac, sp.Mod):
         f = f.replace(sp.frac, lambda x: x - sp.floor(x)).replace(sp.ceiling, lambda x: -sp.floor(-x))
         f = f.replace(sp.Mod, lambda x, m: x - m * sp.floor(x / m))
     sides: dict[sp.Expr, dict[sp.Basic, tuple[Any, Any]]] = {}
-    atoms = [
-        (a, *_sides(a)) for a in f.atoms(*_STEPS, Relational) if not isinstance(a, sp.Max | sp.Min) or len(a.args) == 2
-    ]
+    atoms = [(a, *_sides(a)) for a in f.atoms(*_STEPS, Relational)]
+    atoms += [(a, *_sides(a)) for a in (f.atoms(*_KINKS) if kinks else ()) if len(a.args) < 3]
     atoms += [side for a in f.atoms(sp.Function) for side in _sides_of_quotient(a)]
     for a, g, above, below in atoms:
         if g.free_symbols & wanted:
@@ -264,12 +264,11 @@ def _roots(
         rows, k = rows[near], k[near]
         fixed = [c[rows] for c in columns]
         at = _bisected(lambda z: f(z, *fixed)[0], line[k], line[k + 1])
-        ulps = f(at * (1 + 64 * EPS), *fixed)[0] - f(at * (1 - 64 * EPS), *fixed)[0]
+        with np.errstate(all="ignore"):
+            ulps = f(at * (1 + 64 * EPS), *fixed)[0] - f(at * (1 - 64 * EPS), *fixed)[0]
+            change = f(at * (1 + 1e-6), *fixed)[0] - f(at * (1 - 1e-6), *fixed)[0]
+            rest = np.abs(2e-6 * at * f(at, *fixed)[0] / change)  # what rounding leaves of g, over its slope
         told = np.abs(ulps) <= 1e-3 * (np.abs(value[rows, k]) + np.abs(value[rows, k + 1]))
-        with np.errstate(all="ignore"):  # what rounding leaves of g, over its slope
-            rest = np.abs(
-                2e-6 * at * f(at, *fixed)[0] / (f(at * (1 + 1e-6), *fixed)[0] - f(at * (1 - 1e-6), *fixed)[0])
-            )
         rows, at, rest = rows[told], at[told], np.where(np.isfinite(rest), rest, 0.0)[told]
     if x.is_positive:
         rows, at, rest = rows[at > 0], at[at > 0], rest[at > 0]

@@ -57,29 +57,16 @@ def _sinc(x: Any) -> Any:
     return where(near, series, apply("sin", far) / far)
 
 
-FAR = 40.0
-
-
-def _beyond(near: Callable[[Any], Any], far: Callable[[Any, Any], Any]) -> Callable[[Any], Any]:
-    """A function of x where |x| < `FAR`, and beyond, without overflow, of x and exp(−|x|)."""
-
-    def function(x: Any) -> Any:
-        size = where(x > 0.0, x, -x)
-        close = size < FAR
-        return where(close, near(where(close, x, 1.0)), far(x, apply("exp", -size)))
-
-    return function
-
-
 _SAME = (
     *("exp", "log", "sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh", "asinh", "acosh"),
-    *("atanh", "erf", "erfc", "sign", "floor", "gamma"),
+    *("atanh", "erf", "erfc", "sign", "floor", "gamma", "sech", "csch"),
 )
 """Functions of the same name here and there."""
 # fmt: off
 _OTHER = {
     "jv": sp.besselj, "yv": sp.bessely, "iv": sp.besseli, "kv": sp.besselk, "ellipk": elliptic_k,
     "ellipe": elliptic_e, "hyp2f1": hyp2f1, "expi": sp.Ei,
+    "expit": expit, "bose": bose, "softplus": softplus, "logcosh": logcosh,
     "mod": sp.Mod, "lt": sp.StrictLessThan, "le": sp.LessThan, "eq": sp.Equality, "not": sp.Not,
 }
 """SymPy's functions of those that have other names."""
@@ -89,12 +76,6 @@ _RULES: dict[type, Callable[..., Any]] = {
     sp.cot: _reciprocal("tan"), sp.sec: _reciprocal("cos"), sp.csc: _reciprocal("sin"),
     sp.acot: lambda x: apply("atan", 1.0 / x), sp.Abs: abs,
     sp.coth: _reciprocal("tanh"),
-    sp.sech: _beyond(_reciprocal("cosh"), lambda x, e: 2.0 * e),
-    sp.csch: _beyond(_reciprocal("sinh"), lambda x, e: where(x > 0.0, 2.0 * e, -2.0 * e)),
-    expit: _beyond(lambda x: 1.0 / (1.0 + apply("exp", -x)), lambda x, e: where(x > 0.0, 1.0 - e, e)),
-    bose: _beyond(lambda x: 1.0 / apply("expm1", x), lambda x, e: where(x > 0.0, e, -1.0 - e)),
-    softplus: _beyond(lambda x: apply("log1p", apply("exp", x)), lambda x, e: where(x > 0.0, x, 0.0) + e),
-    logcosh: _beyond(lambda x: apply("log", apply("cosh", x)), lambda x, e: where(x > 0.0, x, -x) - math.log(2.0)),
     triangle: lambda x: math.pi / 2 - abs(apply("mod", x + math.pi / 2, 2 * math.pi) - math.pi),
     sp.loggamma: lambda x: where(x > 0.0, apply("lgamma", x), float("nan")),
     sp.lowergamma: lambda s, x: apply("gamma", s) * apply("gammainc", s, x),

@@ -262,7 +262,7 @@ class SymbolicHamiltonian(Definition):
         """Borders at which H may jump in t alone."""
         if self.time is None:
             return []
-        own = [border for border in borders(self.H, [self.time]) if border.g.free_symbols == {self.time}]
+        own = [border for border in borders(self.H, [self.time], kinks=True) if border.g.free_symbols == {self.time}]
         return [Switch(border, self.time, self.samples) for border in own]
 
     def jump_times(self, low: float, high: float, step: float, kinks: bool = False) -> np.ndarray:

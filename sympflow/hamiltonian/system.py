@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NoReturn, TypedDict, Unpack
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.arguments import check_flag, check_positive, checked_count, floats, real_number, warn
+from sympflow.arguments import advice, check_flag, check_positive, checked_count, floats, real_number, told, warn
 from sympflow.arrays import Array, one_lane
 from sympflow.hamiltonian.domain import Domain, domain_of
 from sympflow.hamiltonian.fingerprint import fingerprint
@@ -50,13 +50,17 @@ MOST_WRITTEN_OUT = 400
 """Coordinates of an expression before a warning: 512 of a chain take 2 s to define, and a step 14 times as long."""
 UNNAMED = "custom"
 MEANT = {
-    **dict.fromkeys(("dim", "dimension", "dimensions"), "degrees of freedom of a function are `ndof`, of pairs `dim`"),
-    **dict.fromkeys(("q0", "p0", "x0"), "the initial state is `y0`, [q, p] in one array"),
-    **dict.fromkeys(("h", "step"), "the step is `dt`"),
-    **dict.fromkeys(("mass", "m"), "masses are in T(p), or `masses` of pairs"),
+    **dict.fromkeys(("dim", "dimension", "dimensions"), "degrees of freedom of a function are `ndof`, of pairs `dim`."),
+    "mass": "masses are in T(p), or `masses` of pairs.",
     **dict.fromkeys(
-        ("site", "sites", "n_sites"), "the number of sites of a lattice is `shape`, their potential `onsite`"
+        ("site", "sites", "n_sites"), "the number of sites of a lattice is `shape`, their potential `onsite`."
     ),
+    **dict.fromkeys(
+        ("V", "U"), "a potential is `potential`, a function of q, or is a part of H as text, by from_sympy."
+    ),
+    **dict.fromkeys(("H", "energy"), "H is `hamiltonian`, a function of q and p, or text, by from_sympy."),
+    **dict.fromkeys(("k", "m", "g", "constants"), "values of symbols are `params`, as params={'k': 1.0}."),
+    "names": "the bodies have numbers, from 0, in the order of `masses`.",
 }
 """Remedies for arguments that other packages have."""
 
@@ -117,9 +121,9 @@ class Scene:
             )
         for name in options:
             if name not in known:
-                instead = f": {MEANT[name]}" if name in MEANT else ""
+                remedy = MEANT.get(name) or advice(name, (*known, "params")) or "remove it."
                 raise TypeError(
-                    f"`{name}` is not an argument of this system, nor of its scene, {', '.join(known)}{instead}."
+                    f"`{name}` is not an argument of this system, nor of its scene, {', '.join(known)}: {remedy}"
                 )
         return cls(**{**defaults, **options})
 
@@ -229,14 +233,20 @@ class HamiltonianSystem(Hamiltonian, Answering):
     """
 
     _OTHER_NAMES: ClassVar[Mapping[str, str]] = {
-        **dict.fromkeys(("solve", "integrate", "run"), "sympflow.solve(system, method, t_span, y0)"),
+        **dict.fromkeys(("solve", "integrate", "run", "simulate"), "sympflow.solve(system, method, t_span, y0)"),
+        **{
+            name: f"sympflow.{name}(system)"
+            for name in ("train", "lyapunov", "ensemble", "compare", "poincare_section")
+        },
+        **dict.fromkeys(("plot", "animate"), "`plot()` of a solution, solve(system, t_span=(0, 100)).plot()"),
         **dict.fromkeys(("H", "energy"), "`hamiltonian(y)` for its values, `expression` for the formula"),
-        **dict.fromkeys(("V", "U"), "`potential(q)`"),
-        **dict.fromkeys(("T", "K"), "`kinetic(p)`"),
+        **dict.fromkeys(("V", "U", "potential_energy"), "`potential(q)`"),
+        **dict.fromkeys(("T", "K", "kinetic_energy"), "`kinetic(p)`"),
         **dict.fromkeys(("dim", "dimension", "n", "d", "dof"), "`ndof`"),
         **dict.fromkeys(("rhs", "f", "fun"), "`vector_field(y)`"),
-        **dict.fromkeys(("grad", "jac"), "`gradient(y)`, or `hessian(y)`"),
-        "parameters": "`params`",
+        **dict.fromkeys(("grad", "jac", "jacobian"), "`gradient(y)`, or `hessian(y)`"),
+        **dict.fromkeys(("parameters", "G", "constants"), "`params`"),
+        **dict.fromkeys(("mass", "masses"), "`local.masses` of bodies, or T of the formula, `expression`"),
     }
     _period: float | None = None
     _former_period: float | None = None
@@ -795,6 +805,7 @@ class HamiltonianSystem(Hamiltonian, Answering):
                     has += "; `damping` is not one: make a system for each value"
                 raise ValueError(f"`params` has {name!r}, no parameter of {self.name!r}, {has}.")
 
+    @told
     def with_params(self, **values: float) -> HamiltonianSystem:
         """The same system with other values of some parameters. Most methods reuse the compiled code.
 

@@ -272,7 +272,8 @@ def step_for(integrator: Integrator, problem: Problem, tol: float, tol_of: str =
     system = with_start(integrator, problem.system.between_impulses, states)
     length = abs(problem.t1 - problem.t0)
     step = float(with_step(integrator, system, states).step_length(system) or system.dt)
-    error = _error(integrator, replace(problem, system=system, y0=states), tol_of, TRIAL_LENGTH * step)
+    trial = replace(problem, system=system, y0=states, events=None)
+    error = _error(integrator, trial, tol_of, TRIAL_LENGTH * step)
     check_applies(integrator, system, states)
     most = min(length, integrator.longest_step(system))
     h = min(step, most)
@@ -336,7 +337,7 @@ def _error(integrator: FixedStep, problem: Problem, tol_of: str, trial: float) -
 
     def error(h: float) -> float:
         n = max(TRIAL_STEPS, min(math.ceil(trial / h), MOST_TRIAL_STEPS) if compiled else 0)
-        n = max(1, min(n, math.ceil(length / h)))
+        n = max(1, math.ceil(min(n, length / h)))
         end, n = min(n * h, length), -(-n // -(-n // TRIAL_STEPS))
         t, y = run(h, end, n)
         times = np.broadcast_to(t.reshape(-1, *[1] * (y0.ndim - 1)), y.shape[:-1])

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from functools import cache, lru_cache
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from sympflow.arguments import did_you_mean
+from sympflow.arguments import OF_RUNS, advice, did_you_mean
 from sympflow.arrays import Array
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.contract import Integrator
@@ -23,18 +23,14 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 GROUP = "sympflow.integrators"
 """The entry-point group in which a distribution announces its integrators: `name = "package.module:Class"`."""
-_INSTEAD = {
-    "args": "values of parameters are in H, or given by `params`",
-    **dict.fromkeys(("q0", "p0", "x0", "v0"), "the initial state is `y0`, [q, p] in one array"),
-    **dict.fromkeys(("rtol", "atol"), "it has fixed steps: give `dt`, or `tol`, for which the step is chosen"),
-    "max_step": "`dt` is the step, and `event_step` samples events within it",
-    **dict.fromkeys(("h", "step", "step_size"), "the step of fixed-step methods is `dt`"),
-    **dict.fromkeys(("n_steps", "num_steps", "steps"), "n steps over `t_span` are dt=(t1 - t0)/n"),
-    **dict.fromkeys(("t_end", "t1", "T", "tmax", "t0"), "times are `t_span`, (start, end)"),
+_FIXED = {
     **dict.fromkeys(
-        ("t", "ts", "times", "saveat"), "times of outputs are `t_eval`, or every few steps by `save_every`"
+        ("rtol", "atol", "reltol", "abstol"), "it has fixed steps: give `dt`, or `tol`, which chooses one."
     ),
+    "max_step": "`dt` is the step, and `event_step` samples events within it.",
+    "flow": "a flow is given in the place of a method.",
 }
+_ADAPTIVE = {"dt": "it chooses its own steps: give `rtol`, or `max_step` if it has one."}
 SYNONYMS = {
     **dict.fromkeys(("velocity_verlet", "stormer_verlet", "störmer_verlet", "kdk"), "verlet"),
     **dict.fromkeys(("position_verlet", "drift_kick_drift", "dkd"), "leapfrog"),
@@ -198,9 +194,11 @@ def build(method: Any, options: dict[str, Any]) -> Integrator:
     known = cls.options() if own else _made(method, cls.options)
     unknown = [name for name in options if name not in known]
     if unknown:
+        remedy = (_FIXED if "dt" in known else _ADAPTIVE).get(unknown[0])
+        remedy = remedy or advice(unknown[0], (*known, *OF_RUNS)) or "remove it or choose another method."
         raise TypeError(
             f"`{unknown[0]}` is not an option of method {cls.name!r}, which takes {', '.join(known) or 'none'}: "
-            f"{_INSTEAD.get(unknown[0], 'remove it or choose another method')}."
+            f"{remedy}"
         )
     if not own:
         return _made(method, lambda: cls(**options))

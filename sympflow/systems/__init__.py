@@ -5,7 +5,7 @@ from collections.abc import Callable
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
-from sympflow.arguments import did_you_mean
+from sympflow.arguments import did_you_mean, told
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.lazy import announced, distribution, load_announced
 from sympflow.systems.celestial import (
@@ -188,6 +188,11 @@ __all__ = ["SYSTEMS", "available", "from_toml", "get", "register"]
 __all__ += ["fodo_matrices", "grid", "kepler_ellipse", "lax_eigenvalues", "magnetic_moment", "oscillatory_energies"]
 __all__ += ["perihelion_angle"]
 __all__ += [factory.__name__ for factory in SYSTEMS.values()]
+
+
+for _key_of, _factory in SYSTEMS.items():
+    SYSTEMS[_key_of] = globals()[_factory.__name__] = told(_factory)
+    SYSTEMS[_key_of].__module__ = __name__  # where pickles find it
 
 
 def __getattr__(name: str) -> Any:

@@ -95,7 +95,11 @@ class LatticeSubsystem:
         domain = self.states.of(judged)
         width = judged.local.numbers
         n = max(FEWEST, min(MOST_ORBITS, NUMBERS // width))
-        flow.figures |= self._step_figures(own, judged, domain, n)
+        labels = Labels.of(judged, states(domain, n, 0, Stream.REFERENCE), flow.dt * np.array([0.5, 1.0]))
+        start = torch.as_tensor(labels.x)
+        found = np.stack([own.psi(t, start).numpy() for t in labels.t.tolist()]) - labels.y
+        unit = labels.x.std(0).mean() + np.zeros(labels.x.shape[1])
+        flow.figures |= {**step_errors(found), "missed_share": shares_missed(found[-1], labels, unit)[0]}
         if judged.conservative:
             size = max(FEWEST, min(MOST_STATES, NUMBERS // width))
             certificate = own.certificate(judged, states=size, times=TIMES, held_out=n, t_end=CERTIFIED * own.dt)
@@ -107,17 +111,6 @@ class LatticeSubsystem:
                 "judged_on": float(judged.ndof),
             }
         return flow
-
-    @torch.no_grad()
-    def _step_figures(self, flow: PrimedFlow, system: HamiltonianSystem, domain: Domain, n: int) -> dict[str, float]:
-        """Errors of one step at held-out states of the lattice, and the share that it misses."""
-        x = states(domain, n, 0, Stream.REFERENCE)
-        labels = Labels.of(system, x, flow.dt * np.array([0.5, 1.0]))
-        start = torch.as_tensor(labels.x)
-        found = np.stack([flow.psi(t, start).numpy() for t in labels.t.tolist()]) - labels.y
-        unit = labels.x.std(0).mean() + np.zeros(labels.x.shape[1])
-        missed = shares_missed(found[-1], labels, unit)[0]
-        return {**step_errors(found), "missed_share": missed}
 
     def _error_at(self, flow: PrimedFlow, end: str) -> float:
         """The relative energy error, above rest, of a few in a row with such ends: the median over states."""

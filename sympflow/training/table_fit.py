@@ -153,20 +153,15 @@ class TableRun(SearchRun):
         return self.frozen or self.whole
 
     @property
-    def most_steps(self) -> int:
-        """Iterations of each of the final fits."""
-        return self.solver.steps
-
-    @property
     def search_steps(self) -> int:
-        return min(SEARCH_STEPS, self.most_steps)
+        return min(SEARCH_STEPS, self.solver.steps)
 
     def found(self, minimum: Minimum) -> dict[str, float]:
         self.table.assign(self._continued(min(self.minima, key=lambda m: m.cost)))
         return self._record(minimum)
 
     def complete(self, session: Session) -> None:
-        finalists, frozen, steps = _distinct(self.minima)[:FINALISTS], self.frozen, self.most_steps
+        finalists, frozen, steps = _distinct(self.minima)[:FINALISTS], self.frozen, self.solver.steps
         if frozen is not None:
             for fit in filter(None, (frozen, self.weighted)):
                 common = (fit, steps, self._frozen_end, True)
@@ -197,7 +192,7 @@ class TableRun(SearchRun):
             warn(f"The flow was not fitted to `runs`, because {reason}.", RuntimeWarning)
             self.runs = None
             return False
-        common = both, min(self.most_steps, RUN_STEPS), self.whole_end, False
+        common = both, min(self.solver.steps, RUN_STEPS), self.whole_end, False
         best = min(session.each(descended, common, tables, self.whole_end, both.compiled), key=lambda m: m.cost)
         theta = runs.parameters(best.x)
         if self.fit.label_times >= self.flow.shape.degree:  # fewer would leave the polynomials open in between

@@ -55,7 +55,7 @@ class TableStep:
         self.balanced = self._driven and not system.friction
         self._times_inverse_mass, self._friction = partial(_velocity, system, 1.0), system.friction
         if self._driven and system.friction:
-            self._friction = Friction(_extended(system.friction.matrix(system.ndof), 0.0))
+            self._friction = Friction(np.pad(system.friction.matrix(system.ndof), (0, 2)))  # none of t and s
         self._forces_of = system, level, monomials, compiled
         n, terms = len(sequence), len(monomials) or level
         kicks = [i for i in range(n) if sequence[i] == "kick"]
@@ -195,16 +195,8 @@ class ArrayErrors:
         return split.swapaxes(-2, -3).reshape(*errors.shape[:-2], -1)
 
 
-def _extended(matrix: np.ndarray, of_time: float) -> np.ndarray:
-    """A matrix (d, d) with rows and columns of t and s, 0 but for one entry."""
-    d = len(matrix)
-    extended = np.zeros((d + 2, d + 2))
-    extended[:d, :d], extended[d, d] = matrix, of_time
-    return extended
-
-
 def _velocity(system: HamiltonianSystem, of_time: float, p: np.ndarray) -> np.ndarray:
-    """M⁻¹p of rows (..., D), extended likewise."""
+    """M⁻¹p of rows (..., D), that of t times a number, and 0 for s."""
     d = system.ndof
     return np.concatenate([system.velocity(p[..., :d]), of_time * p[..., d : d + 1], 0 * p[..., d + 1 :]], axis=-1)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import difflib
 import inspect
 import math
 from collections.abc import Callable
@@ -14,7 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from sympflow.arguments import check_one_of, plain, real_number
+from sympflow.arguments import advice, check_one_of, plain, real_number
 from sympflow.arrays import is_tensor
 from sympflow.flow.flow_map import FlowMap
 from sympflow.flow.primed import PrimedFlow
@@ -270,9 +269,8 @@ def _refuse_unknown(options: dict[str, Any]) -> None:
             if name in inspect.signature(maker).parameters:
                 by = maker.__qualname__
                 raise TypeError(f"`{name}` is an option of {by}: pass flow={by}(system, ..., {name}={value!r}).")
-        close = difflib.get_close_matches(name, known, n=1)
-        hint = f"is `{close[0]}` meant? There are" if close else "choose from"
-        raise TypeError(f"`{name}` is not an option of train(): {hint} {', '.join(known)}.")
+        remedy = advice(name, known) or "remove it."
+        raise TypeError(f"`{name}` is not an option of train(), which takes {', '.join(known)}: {remedy}")
 
 
 def _known_system(system: Any, data: Any) -> HamiltonianSystem:

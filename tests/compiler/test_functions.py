@@ -26,6 +26,10 @@ EXACT = {  # by mpmath, of functions that have another name there
     "max": max,
     "mod": lambda a, b: a - mpmath.floor(a / b) * b,
     "lgamma": mpmath.loggamma,
+    "expit": lambda x: 1 / (1 + mpmath.exp(-x)),
+    "bose": lambda x: 1 / mpmath.expm1(x),
+    "softplus": lambda x: mpmath.log1p(mpmath.exp(x)),
+    "logcosh": lambda x: mpmath.log(mpmath.cosh(x)),
     **{f"polygamma{n}": partial(mpmath.polygamma, n) for n in range(1, MOST_DERIVATIVES + 1)},
 }
 POINTS = {  # where the function is smooth

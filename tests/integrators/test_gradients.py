@@ -269,7 +269,7 @@ def test_dense_output_has_the_gradients_of_outputs():
     for more in ({"dense_output": True}, {"t_eval": [1.234]}):
         y = torch.tensor(start(CUBIC, ()), requires_grad=True)
         sol = solve(CUBIC, "srkn6b", (0, 2), y, dt=0.1, **more)
-        state = sol.y[:, 0] if sol.sol is None else sol.sol(1.234)
+        state = sol.y[:, 0] if not sol.sol else sol.sol(1.234)
         found.append(torch.autograd.grad(state.sum(), y)[0])
     torch.testing.assert_close(*found, rtol=1e-13, atol=0)
 

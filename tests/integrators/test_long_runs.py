@@ -107,7 +107,7 @@ def test_what_was_computed_before_ctrl_c_is_kept(short_windows, monkeypatch, y0,
     np.testing.assert_array_equal(sol.t, whole.t[:n])
     np.testing.assert_array_equal(sol.y, whole.y[..., :n])
     assert n == np.count_nonzero(whole.t < until + DT / 2) or "events" in options
-    if sol.sol is not None:
+    if sol.sol:
         np.testing.assert_array_equal(sol.sol(3.3), whole.sol(3.3))
     if sol.t_events is not None:
         np.testing.assert_array_equal(sol.t_events[0], whole.t_events[0][whole.t_events[0] <= until])
