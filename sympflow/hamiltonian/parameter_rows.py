@@ -22,7 +22,9 @@ from sympflow.lazy import lately_kept
 MOST_SHOWN = 4  # values of a row, in messages
 
 
-_of_values = lately_kept(HamiltonianSystem.with_params)
+@lately_kept
+def _of_values(system: HamiltonianSystem, **values: float) -> HamiltonianSystem:
+    return system.with_params(**values)
 
 
 class Rows(NamedTuple):
