@@ -363,7 +363,7 @@ def _solved(integrator: Integrator, problem: Problem, action: str, rows: Paramet
     integrator.check_library(y_start)
     run: Callable[[Integrator, Problem], tuple[Outcome, Problem]] = _run
     able = problem.store is None and problem.parameter_values is None
-    told, jumps = landings(integrator, between, problem.t0, problem.t1, able, kinks=True)
+    told, jumps = landings(integrator, between, problem.t0, problem.t1, able, kinks=rows is None)
     if told:
         without = "a `store`" if problem.store is not None else "gradients by `params`, and with `t_eval`"
         warn(told if able else f"{told} Without {without}, steps end at jumps.", RuntimeWarning)
@@ -555,7 +555,7 @@ def _look_for_poles(store: RunStore, piece: Outcome, integrator: Integrator, bef
     """Note that a run passed a pole between outputs of a window, and the state before them; of each trajectory once."""
     known = np.array(store.noted.get("failed_at", np.full(before.y0.shape[:-1], np.nan)), dtype=float)
     piece.status = np.where(np.isnan(known), 0, -1) if known.ndim else 0 if np.isnan(known) else -1
-    if note_poles(piece, integrator, before, None):
+    if any(each.certain for each in note_poles(piece, integrator, before, None)):
         at = np.where(np.isnan(known), piece.stats["failed_at"], known)
         store.noted |= {"failed_at": at.tolist(), "passed": store.noted.get("passed", piece.message)}
 

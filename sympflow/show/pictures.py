@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -21,12 +21,7 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7
 
 
 def trajectory_figure(
-    t: np.ndarray,
-    y: np.ndarray,
-    energy_error: np.ndarray | None,
-    title: str,
-    kinds: Sequence[str] = KINDS,
-    marker: str = "",
+    t: np.ndarray, y: np.ndarray, energy_error: Any, title: str, kinds: Sequence[str] = KINDS, marker: str = ""
 ) -> Figure:
     """Panels of trajectories y (N, 2d, n) at t, (n,) or (N, n), with a `marker` where states are samples."""
     unknown = [kind for kind in kinds if kind not in KINDS]
