@@ -481,16 +481,8 @@ def constants(frame: Frame, groups: int) -> tuple[np.ndarray, np.ndarray]:
     table = np.zeros((len(ROWS), groups * LANES))
     m, S = masses[frame.order], frame.sums
     table[:, :] = np.array([0.0, G * S[-1], 0.0, 1.0, 0.0, 0.0, G * masses[0], 0.0])[:, None]
-    table[:, :n] = [
-        G * m,
-        frame.mu[:n],
-        m / S[1:],
-        S[1:] / S[:-1],
-        1 / S[:-1],
-        m,
-        np.full(n, G * masses[0]),
-        m / masses[0],
-    ]
+    heliocentric = np.full(n, G * masses[0]), m / masses[0]
+    table[:, :n] = [G * m, frame.mu[:n], m / S[1:], S[1:] / S[:-1], 1 / S[:-1], m, *heliocentric]
     limits = np.zeros((groups * LANES, groups * LANES))
     i, j = np.triu_indices(n, 1)
     limits[i, j] = limits[j, i] = frame.limits

@@ -384,14 +384,8 @@ class PairSums(Forces):
         """Coordinates, velocities along which a sum is taken, columns; in the order of cells, if there are some."""
         code, dim = state.code, self.dim
         size, sites = field(context, "size"), place(context, "sites")
-        x, v, c = (
-            [code.at(first, size * (k + shift)) for k in range(count)]
-            for first, shift, count in (
-                (state, 0, dim),
-                (along, 0, 0 if kind == "gradient" else dim),
-                (sites, 1, self.columns),
-            )
-        )
+        places = (state, 0, dim), (along, 0, 0 if kind == "gradient" else dim), (sites, 1, self.columns)
+        x, v, c = ([code.at(first, size * (k + shift)) for k in range(n)] for first, shift, n in places)
         if self.cells is None:
             return [*x, *v, *c]
         n, order, ready = field(context, "bodies"), place(context, "order"), place(context, "sorted")
@@ -435,14 +429,8 @@ class PairSums(Forces):
                     j = ((first >> SHIFT) + k) << SHIFT
                     number = code.splat(j, LANES) + lanes
                     other = [code.load(row, j, _LANES) for row in rows]
-                    pair = law.met(
-                        numbers,
-                        mine[:moved],
-                        other[:moved],
-                        [*mine[moved:], *other[moved:]],
-                        (bounds[0] < number) & (number < bounds[1]),
-                    )
-                    of_pair = parts(kind, *pair)
+                    columns, inside = [*mine[moved:], *other[moved:]], (bounds[0] < number) & (number < bounds[1])
+                    of_pair = parts(kind, *law.met(numbers, mine[:moved], other[:moved], columns, inside))
                     for axis in range(dim):
                         at = size * axis + j
                         code.store(with_parts(code.load(F, at, _LANES), of_pair, axis, -1.0), F, at)

@@ -626,15 +626,7 @@ class ColumnStage:
     """The stage of a column: all lanes have the same numbers, or each its own, in tables of a length."""
 
     def __init__(
-        self,
-        code: Code,
-        table: Value,
-        kinds: Value,
-        size: int,
-        lanes: int,
-        width: int,
-        stage: Stage | MemoryStage,
-        length: Value | None = None,
+        self, code: Code, table: Value, kinds: Value, size: int, lanes: int, width: int, stage: Any, length: Any = None
     ) -> None:
         self.code, self._table, self._kinds, self._size, self._lanes = code, table, kinds, size, lanes
         self._width, self._stage, self._length = width, stage, length

@@ -109,17 +109,9 @@ class LabelErrors:
     are in proportion.
     """
 
-    def __init__(
-        self,
-        loops: TableLoops,
-        x: np.ndarray,
-        t0: np.ndarray | None,
-        y: np.ndarray,
-        scale: np.ndarray,
-        slope: np.ndarray,
-        design: np.ndarray,
-    ) -> None:
-        self._loops, self._count, self._given = loops, x.shape[1], (x, t0, y, scale, slope, design)
+    def __init__(self, loops: TableLoops, *labels: Any) -> None:
+        x, t0, y, scale, slope, design = labels
+        self._loops, self._count, self._given = loops, x.shape[1], labels
         times = len(design)
         leaders, leader, factors = _in_proportion(design.swapaxes(0, 1).reshape(design.shape[1], -1))
         self.matrices = np.ascontiguousarray(design[:, leaders])
