@@ -26,7 +26,7 @@ from sympflow.hamiltonian.formulas import evaluator
 from sympflow.kernels.array_splittings import ARRAYS, ArrayCode, Forces, FunctionSplitting
 from sympflow.kernels.cells import MOST_RANGES, Cells, most_along, most_cells
 from sympflow.kernels.rollouts import aligned, zeros
-from sympflow.kernels.runs import Numbers, Room, begun, finished
+from sympflow.kernels.runs import Numbers, Room, Values, begun, finished
 from sympflow.kernels.splittings import Shape, Splitting, Stage, WithinRange
 from sympflow.kernels.teams import Member, SharedMemory, SharedRollouts, meet
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL
@@ -81,14 +81,7 @@ class PairLaw:
         inverse = np.zeros(local.dim) if local.box is None else 1 / local.box
         return np.array([local.softening**2, end, *box, *inverse, *self.program.table(*local.constants)])
 
-    def met(
-        self,
-        numbers: Sequence[Value],
-        own: Sequence[Value],
-        other: Sequence[Value],
-        columns: Sequence[Value],
-        inside: Value | None = None,
-    ) -> Pair:
+    def met(self, numbers: Values, own: Values, other: Values, columns: Values, inside: Value | None = None) -> Pair:
         """A body with positions, and velocities behind them, and its partners, which are `inside`; 0 for others."""
         code, dim = own[0].code, self.dim
         softening, end, rest = numbers[0], numbers[1], numbers[2 + 2 * dim :]

@@ -47,6 +47,7 @@ Adjoint = Callable[..., tuple[list[Value], list[Value]]]
 with `slopes` of its numbers, for those of the values after it; with the room, where states are in memory."""
 MemoryStage = Callable[["Room", Numbers, Value, Value], None]
 """The same of a state in memory, which it changes in place."""
+AnyStage = Stage | MemoryStage
 OfValues = Callable[[Sequence[Value], Sequence[Value], Value], Sequence[Value]]
 """``of_values(given, cotangents, kind)``: the cotangents of the values of parameters that are the last numbers given,
 for those of the numbers that a stage reads."""
@@ -59,7 +60,7 @@ def run_function(
     n_values: int,
     n_out: int,
     size: int,
-    stage: Stage | MemoryStage,
+    stage: AnyStage,
     width: int = 1,
     own: bool = False,
     memory: Callable[..., Memory] | None = None,
@@ -241,13 +242,7 @@ def reverse_function(
 
 
 def map_function(
-    n_values: int,
-    n_out: int,
-    size: int,
-    stage: Stage | MemoryStage,
-    width: int = 1,
-    memory: Callable[..., Memory] | None = None,
-    timed: bool = False,
+    n_values: int, n_out: int, size: int, stage: AnyStage, width: int = 1, memory: Any = None, timed: bool = False
 ) -> Callable[..., None]:
     """Compile a map of rows: all columns of one table. If `timed`, stages are given the steps of each lane.
 
@@ -285,7 +280,7 @@ def step_function(
     powers: Sequence[int],
     own: int,
     numbers: Callable[..., Sequence[Any]],
-    stage: Stage | MemoryStage,
+    stage: AnyStage,
     width: int = 1,
     memory: Callable[..., Memory] | None = None,
 ) -> Callable[..., None]:
