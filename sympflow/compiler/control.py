@@ -15,19 +15,8 @@ from typing import Any, NamedTuple
 from sympflow.compiler.numbers import Number
 
 __all__ = [
-    "BOOL",
-    "DOUBLE",
-    "INT",
-    "LOWERED",
-    "POINTER",
-    "Code",
-    "Module",
-    "Rows",
-    "Sweep",
-    "Type",
-    "Value",
-    "Variable",
-]
+    "BOOL", "DOUBLE", "INT", "LOWERED", "POINTER", "Code", "Module", "Rows", "Sweep", "Type", "Value", "Variable",
+]  # fmt: skip
 
 
 class Type(NamedTuple):

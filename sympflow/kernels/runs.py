@@ -18,19 +18,9 @@ from sympflow.compiler.control import BOOL, INT, POINTER, Code, Module, Rows, Ty
 from sympflow.compiler.machine import compiled, host
 
 __all__ = [
-    "Lanes",
-    "Memory",
-    "Numbers",
-    "Room",
-    "Values",
-    "begun",
-    "finished",
-    "groups",
-    "map_function",
-    "reverse_function",
-    "run_function",
-    "step_function",
-]
+    "Lanes", "Memory", "Numbers", "Room", "Values", "begun", "finished", "groups", "map_function", "reverse_function",
+    "run_function", "step_function",
+]  # fmt: skip
 
 FAST_MEMORY = 16_384  # bytes of the states of a chunk after the other, and of their ends
 MOST_CHUNKS = 32
