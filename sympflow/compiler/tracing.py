@@ -198,7 +198,7 @@ def _array(x: Any, kind: type[TracedArray] = TracedArray) -> TracedArray:
 
 def _wrapped(x: Any, kind: type[TracedArray]) -> Any:
     """A result of raw arrays as it is given to the function again."""
-    if isinstance(x, Traced) or (isinstance(x, np.ndarray) and x.dtype == object):
+    if isinstance(x, Traced | float) or (isinstance(x, np.ndarray) and x.dtype == object):
         return _array(x, kind)
     return type(x)(_wrapped(y, kind) for y in x) if type(x) in (list, tuple, _Extremes) else x
 
