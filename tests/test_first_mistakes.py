@@ -196,7 +196,8 @@ def test_the_answer_names_the_remedy(call, kind, answer):
 
 
 def test_a_solution_without_dense_output_has_none_as_in_scipy():
-    assert ran().sol is None and ran().to_scipy()["sol"] is None
+    assert ran().sol is None
+    assert ran().to_scipy()["sol"] is None
     assert solve(SPRING, "verlet", (0, 1), [1, 0], dt=0.1, dense_output=True).sol
 
 

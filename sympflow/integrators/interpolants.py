@@ -54,9 +54,6 @@ class Interpolant:
         h = self.end - self.begin
         return _BASES[len(states), len(slopes)], [*states, *(h * f for f in slopes)]
 
-    def __getstate__(self) -> dict[str, Any]:
-        return vars(self) | {"values": self.values, "_values": None}  # which go through the method's own steps
-
     def __call__(self, t: float) -> Array:
         basis, values = self.values
         x = (float(t) - self.begin) / (self.end - self.begin)
