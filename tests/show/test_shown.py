@@ -134,7 +134,7 @@ def test_a_system_of_a_file_is_called_by_its_file(tmp_path):
     assert orbits(system).plot().get_suptitle().startswith("own.py:morse")
 
 
-@pytest.mark.parametrize(("dt", "joined"), [(0.1, True), (1.0, False)])
+@pytest.mark.parametrize(("dt", "joined"), [(0.1, True), (1.0, True), (2.5, False)])
 def test_curves_are_joined_where_they_are_known_between_points(dt, joined):
     line = sympflow.solve("harmonic-oscillator", "kahan_li8", (0, 30), dt=dt).plot("phase")
     assert (line.axes[0].lines[0].get_linestyle() == "-") == joined
