@@ -124,7 +124,7 @@ class Frame:
             x.append(q[..., i, :] - R)
             R = R + w * x[-1]
             centres.append(R)
-        planets = stack(x, axis=-2)
+        planets = stack(x, axis=-2) if x else q[..., :0, :]
         if len(self.test):
             planets = concatenate([planets, q[..., self.test, :] - stack(centres, axis=-2)[..., self.inside, :]], -2)
         return planets, R

@@ -525,7 +525,7 @@ class HamiltonianSystem(Hamiltonian, Answering):
             Values of other names in `extra`.
         name, domain, y0, t_span, dt, energy_scale, exact
             As for the class; `t_span` is by default a thousand of the longest periods, `dt` a twentieth of the
-            shortest.
+            shortest; of planets that are bound to each other the step is chosen as for any system.
 
         Raises
         ------
@@ -542,9 +542,12 @@ class HamiltonianSystem(Hamiltonian, Answering):
 
         masses, G, y0 = checked_planets(masses, elements, scene.get("y0"), G, units)
         local = PlanetsHamiltonian(masses, G, y0, coordinates, encounter, extra, params)
-        span, dt = (0.0, 1000 * float(local.frame.periods.max())), local.frame.longest_step
+        span = (0.0, 1000 * float(local.frame.periods.max()))
+        with suppress(ValueError):  # of moons, whose step is left to the choice of the method
+            local.frame.check("kepler")
+            scene["dt"] = scene.get("dt") or local.frame.longest_step
         given = {name: value for name, value in scene.items() if value is not None} | {"y0": y0}
-        return cls._of_local(local, None, Scene.given(given, name="planets", t_span=span, dt=dt))
+        return cls._of_local(local, None, Scene.given(given, name="planets", t_span=span))
 
     def subsystem(
         self, sites: int | Sequence[int] | None = None, boundary: str | Sequence[str] = "periodic"
