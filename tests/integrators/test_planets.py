@@ -564,7 +564,11 @@ def test_bad_arguments_of_elements(call, error, message):
 @pytest.mark.parametrize(
     ("system", "options", "message"),
     [
-        (SOLAR, {"method": "wisdom_holman", "dt": 12.0, "t_span": (0, 800.0)}, "`dt` 12 is long .* body 1, 87.97, apart"),
+        (
+            SOLAR,
+            {"method": "wisdom_holman", "dt": 12.0, "t_span": (0, 800.0)},
+            "`dt` 12 is long .* body 1, 87.97, apart",
+        ),
         (systems.outer_solar_system(), {"method": "wisdom_holman", "t_span": (0, 2e4)}, "cross, .* bodies 4 and 5"),
     ],
 )
