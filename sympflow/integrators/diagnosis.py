@@ -696,8 +696,9 @@ def warn_of_loss(outcome: Outcome, integrator: Integrator, system: HamiltonianSy
         return
     width = 2 * system.ndof
     with np.errstate(all="ignore"):
-        H0, H = (system.hamiltonian(to_numpy(y).reshape(-1, width)) for y in (y0, outcome.y[-1]))
-        error = np.abs(H - H0) / (system.energy_scale or np.maximum(np.abs(H0), np.abs(H)))
+        y = to_numpy(outcome.y[:: -max(1, len(outcome.y) // LOOKED_AT)] if readable(outcome.y) else outcome.y[-1:])
+        H0, H = system.hamiltonian(to_numpy(y0).reshape(-1, width)), system.hamiltonian(y.reshape(len(y), -1, width))
+        error = np.fmax.reduce(np.abs(H - H0) / (system.energy_scale or np.maximum(np.abs(H0), np.abs(H))))
     certificate, figures = flow.certified, flow.figures
     known, held, times = "has an error in one step of", figures.get("one_step_error_max") or 0.0, MANY_STEPS
     if certificate is not None:
@@ -710,7 +711,7 @@ def warn_of_loss(outcome: Outcome, integrator: Integrator, system: HamiltonianSy
     which = "" if len(off) == 1 else f" of trajectory {row}, the worst of {off.sum()} such,"
     warn(
         f"The state left the domain of the flow at t = {outcome.stats['domain_exit']:.10g}, and the relative energy "
-        f"error{which} is {error[row]:.2g} at t = {outcome.t[-1]:.10g}: the flow {known} {held:.2g} inside. "
+        f"error{which} is {error[row]:.2g}: the flow {known} {held:.2g} inside. "
         "Start inside its `domain`, train a flow on one that holds these states, or take a scheme such as 'srkn11b'.",
         RuntimeWarning,
     )
