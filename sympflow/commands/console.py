@@ -64,9 +64,7 @@ OF_METHODS = "rtol", "atol", "max_step", "max_steps", "splitting", "clock", "shi
 def in_options(message: str, context: typer.Context) -> str:
     """A message of the library in the options of the command: `t_span` is `--t-end`, backend='array' too."""
     parameters = context.command.params
-    named = {
-        str(p.name): max(p.opts, key=lambda word: (word.startswith("--"), -p.opts.index(word))) for p in parameters
-    }
+    named = {str(p.name): max(p.opts, key=lambda w: (w.startswith("--"), -p.opts.index(w))) for p in parameters}
     options = {name: option for name, option in named.items() if option.startswith("-")}
     for name, others in OPTIONS.items():
         option = next((options[other] for other in others if other in options), None)
@@ -207,9 +205,7 @@ def tell(folder: Path, written: list[Path]) -> None:
     out.print(f"\nWritten to {folder}: {', '.join(path.name for path in written)}")
 
 
-def write_comparisons(
-    comparisons: list[Any], found: list[Scene], folder: Path, say: Callable[[str], None]
-) -> list[Path]:
+def write_comparisons(comparisons: Any, found: list[Scene], folder: Path, say: Callable[[str], None]) -> list[Path]:
     """For each system its CSV, JSON and figures; for several also one CSV and one figure of all."""
     from sympflow.show.style import save
     from sympflow.studies.figures import overview, save_comparison

@@ -30,15 +30,9 @@ def learn(
         Option("--separable/--not-separable", help="H = T(p) + V(q), or known not to be. Default: by the data."),
     ] = None,
     mass: Annotated[Text, Option(help="M of T = p²/2M, one number or d of them, as 1,2.5.")] = None,
-    known: Annotated[
-        Text, Option(help="A system that is a part of H, as own.toml or pendulum; the rest is learned.")
-    ] = None,
-    family: Annotated[
-        Text, Option(help="The only family of models, as polynomial, network or sympflow. Default: all.")
-    ] = None,
-    order: Annotated[
-        str, Option(help="Of columns without the names q1 …: halves, q1 q2 p1 p2, or pairs, q1 p1 q2 p2.")
-    ] = "halves",
+    known: Annotated[Text, Option(help="A part of H, as own.toml or pendulum; the rest is learned.")] = None,
+    family: Annotated[Text, Option(help="The only family, as polynomial, network or sympflow. Default: all.")] = None,
+    order: Annotated[str, Option(help="Of columns not named q1 …: halves q1 q2 p1 p2, pairs q1 p1 q2 p2.")] = "halves",
     observed: Annotated[
         str, Option(help="qp, states; qv, positions and velocities, of a mass that is not known; q, positions alone.")
     ] = "qp",
@@ -86,12 +80,9 @@ def learn(
         options["mass"] = masses[0] if masses and len(masses) == 1 else masses
         flow = learn_flow(runs, known=_known(known), progress=not quiet, **options)
         flow.save(to)
-        titles = ["model", "numbers", "held-out loss", "correlation"]
-        rows = [
-            [h["model"], str(h["parameters"]), f"{h['held_out_loss']:.4g}", f"{h['correlation']:.2f}"]
-            for h in flow.history
-        ]
-        print_table(titles, rows)
+        cells = "{model} {parameters} {held_out_loss:.4g} {correlation:.2f}"
+        titles = ("model", "numbers", "held-out loss", "correlation")
+        print_table(titles, [[form.format(**h) for form in cells.split()] for h in flow.history])
         learned = flow.recipe["learned"]
         out.print(f"Chosen: {learned['model']}, for {learned['reason']}", markup=False)
         formula = learned.get("physical")

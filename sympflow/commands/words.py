@@ -8,9 +8,9 @@ import keyword
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import wraps
+from functools import partial, wraps
 from pathlib import Path
-from typing import Annotated, Any, overload
+from typing import Annotated, Any
 
 import numpy as np
 import typer
@@ -118,16 +118,6 @@ def made(scene: str, **params: Any) -> HamiltonianSystem:
     return system
 
 
-def _making(scene: str) -> Callable[..., HamiltonianSystem]:
-    """`made` of one scene, with the parameters that it has."""
-
-    @wraps(factory_of(scene))
-    def make(**params: Any) -> HamiltonianSystem:
-        return made(scene, **params)
-
-    return make
-
-
 @dataclass(frozen=True)
 class Scene:
     """A system as asked for; its key names its files."""
@@ -182,10 +172,8 @@ def scenes(words: Sequence[str] | None, own: Sequence[str] | None = None) -> lis
 def _told_apart(found: list[Scene]) -> list[Scene]:
     """The scenes with keys that differ, so that none overwrites the files of another."""
     keys = [scene.key for scene in found]
-    numbers = [keys[:i].count(key) + 1 for i, key in enumerate(keys)]
-    return [
-        scene if n == 1 else replace(scene, key=f"{scene.key}-{n}") for scene, n in zip(found, numbers, strict=True)
-    ]
+    nth = [keys[:i].count(key) + 1 for i, key in enumerate(keys)]
+    return [scene if n == 1 else replace(scene, key=f"{scene.key}-{n}") for scene, n in zip(found, nth, strict=True)]
 
 
 def shown(value: Any) -> str:
@@ -298,7 +286,8 @@ def _parted(word: str) -> tuple[str, Callable[..., HamiltonianSystem], list[str]
         close = files or difflib.get_close_matches(last, scene_names(), n=1, cutoff=0.5)
         hint = f"Did you mean {close[0]!r}? Else {SYSTEM}" if close else f"{SYSTEM[0].upper()}{SYSTEM[1:]}"
         raise ValueError(f"`system` {name!r} is unknown. {hint}.")
-    return name, _making(name), [pair for pair in pairs if pair]
+    make: Any = wraps(factory_of(name))(partial(made, name))  # with the parameters that the scene has
+    return name, make, [pair for pair in pairs if pair]
 
 
 def _scene(name: str, factory: Callable[..., HamiltonianSystem], pairs: list[str], shared: dict[str, str]) -> Scene:
@@ -400,16 +389,8 @@ def _pairs(words: Sequence[str]) -> list[tuple[str, str]]:
     return list(found.items())
 
 
-@overload
-def state(words: str) -> np.ndarray: ...
-
-
-@overload
-def state(words: None) -> None: ...
-
-
-def state(words: str | None) -> np.ndarray | None:
-    """A state from ``0.3,-0.3,0.3,0.15``."""
+def state(words: str | None) -> Any:
+    """A state from ``0.3,-0.3,0.3,0.15``, an array; None without any words."""
     if words is None:
         return None
     return np.array([_float("--y0", word) for word in re.split(r"\s*[,\s]\s*", words.strip("[]() "))])

@@ -71,17 +71,13 @@ class Drawn:
         out = np.empty((stop - start, self.width))
         for block in range(start // DRAWN, -(-stop // DRAWN)):
             low, high = max(start, block * DRAWN), min(stop, (block + 1) * DRAWN)
-            out[low - start : high - start] = self._block(block)[low - block * DRAWN : high - block * DRAWN]
+            states = self._last.get(block)
+            if states is None:
+                states = self._drawn(block)
+                self._last.clear()  # but the last block, which small chunks share
+                self._last[block] = states
+            out[low - start : high - start] = states[low - block * DRAWN : high - block * DRAWN]
         return out
-
-    def _block(self, block: int) -> np.ndarray:
-        """The states of a block; the last one that was drawn is kept, for small chunks share it."""
-        states = self._last.get(block)
-        if states is None:
-            states = self._drawn(block)
-            self._last.clear()
-            self._last[block] = states
-        return states
 
     def _drawn(self, block: int) -> np.ndarray:
         seeds = np.random.SeedSequence([self.seed, block])

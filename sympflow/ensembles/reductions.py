@@ -151,9 +151,7 @@ class OfFunction(Reduction):
             except ValueError as error:
                 raise ValueError(f"`reduce` cannot be kept: {error}") from None
             return dict(self.found)
-        raise ValueError(
-            f"`reduce` cannot be tried: the first {len(problem)} orbits all fail. Reduce `dt`, or mend `y0`."
-        )
+        raise ValueError(f"`reduce` cannot be tried: the first {len(problem)} orbits fail. Reduce `dt`, or mend `y0`.")
 
     def reduce(self, chunk: Chunk) -> dict[str, np.ndarray]:
         out = {name: np.full((len(chunk), *shape), np.nan, dtype) for name, (shape, dtype) in self.found.items()}
@@ -197,13 +195,9 @@ def _arrays(value: Any) -> dict[str, np.ndarray]:
             array = np.empty(0, dtype=object)
         whole = array.dtype.kind in "iu" or (array.dtype == object and all(isinstance(x, int) for x in array.flat))
         if whole and array.size and max(-int(array.min()), int(array.max())) > EXACT:
-            raise ValueError(
-                f"{name} has an integer beyond 2**53, which floats would change: return its parts, or a float"
-            )
+            raise ValueError(f"{name} has an integer beyond 2**53, which floats change: return its parts, or a float")
         if array.dtype.kind not in "biufc" or not isinstance(name, str):
-            raise TypeError(
-                f"`reduce` must return numbers, an array of them, or a dict of such by name; got {type(v).__name__}."
-            )
+            raise TypeError(f"`reduce` must return numbers, an array, or a dict of such; got {type(v).__name__}.")
         arrays[name] = array.astype(complex if array.dtype.kind == "c" else float)
     return arrays
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from itertools import product
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -63,10 +63,8 @@ def chunk_shape(shape: Index, chunk: int) -> Index:
 def blocks(shape: Index, sizes: Index) -> list[Block]:
     """The blocks of a grid, in C order."""
     axes = [[(i, min(i + k, n)) for i in range(0, n, k)] for n, k in zip(shape, sizes, strict=True)]
-    return [
-        Block(ranges, int(np.ravel_multi_index([start for start, _ in ranges], shape)))
-        for ranges in itertools.product(*axes)
-    ]
+    places = ((ranges, np.ravel_multi_index([start for start, _ in ranges], shape)) for ranges in product(*axes))
+    return [Block(ranges, int(place)) for ranges, place in places]
 
 
 @dataclass(frozen=True)
@@ -156,11 +154,9 @@ class Layout:
         made["status"] = (self.dims, self.shape, np.dtype(np.int8), sizes)
         for name, values in self.coordinates().items():
             made[name] = ((name,), values.shape, values.dtype, values.shape)
-        missing = {"status": NOT_RUN}
-        return {
-            name: Field(*array, attributes=names.NAMED.get(name, {}), missing=missing.get(name))
-            for name, array in made.items()
-        }
+        told: dict[str, Any] = {name: {"attributes": names.NAMED.get(name, {})} for name in made}
+        told["status"]["missing"] = NOT_RUN
+        return {name: Field(*array, **told[name]) for name, array in made.items()}
 
 
 MOST_SHOWN = 10_000_000  # numbers of an ensemble beyond which a notebook shows no figure of it
@@ -355,5 +351,4 @@ class Ensemble(Shown):
             If pandas or xarray is not installed.
         """
         imported("pandas", "to_dataframe()")
-        data = self.to_xarray()
-        return names.table(data, (*map(axis_name, self.params), ORBIT, TIME))
+        return names.table(self.to_xarray(), (*map(axis_name, self.params), ORBIT, TIME))

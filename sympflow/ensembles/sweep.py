@@ -199,9 +199,7 @@ def ensemble(
     return Ensemble(layout.times, axes, system, integrator, (t0, t1), orbits, keeper, seconds)
 
 
-def _axes(
-    system: HamiltonianSystem, params: Mapping[str, ArrayLike] | None
-) -> tuple[dict[str, float], dict[str, np.ndarray]]:
+def _axes(system: HamiltonianSystem, params: Any) -> tuple[dict[str, float], dict[str, np.ndarray]]:
     """The parameters that are numbers, and those that are axes."""
     if params is None:
         return {}, {}
@@ -214,9 +212,7 @@ def _axes(
         values = floats("params", given)
         if not np.isfinite(values).all():
             where = int(np.flatnonzero(~np.isfinite(np.ravel(values)))[0])
-            raise ValueError(
-                f"`params` has {name} = {np.ravel(values)[where]} at {where}: give finite numbers, or leave it out."
-            )
+            raise ValueError(f"`params` has {name} = {np.ravel(values)[where]} at {where}: give finite ones.")
         if values.ndim > 1 or values.size == 0:
             raise ValueError(
                 f"`params` must give {name!r} a number, or a list of them; got shape {values.shape}. For "

@@ -26,9 +26,10 @@ if TYPE_CHECKING:
 
 MOST_IN_SYMBOLS = 300  # operations
 _JUMPING = {"sign", "floor", "mod", "where", "lt", "le", "eq", "atan2"}
-_SINGULAR = {"div": 1} | dict.fromkeys(
-    ("pow", "log", "log1p", "tan", "sqrt", "acos", "asin", "acosh", "atanh", "gamma", "lgamma", "digamma", "ellipk"), 0
-)
+_SINGULAR = {"div": 1} | dict.fromkeys((
+    "pow", "log", "log1p", "tan", "sqrt", "acos", "asin", "acosh", "atanh", "gamma", "lgamma", "digamma", "ellipk",
+    "bose", "csch",
+), 0)  # fmt: skip
 """The argument by which an operation is infinite or no number."""
 _AS_THEIR_ARGUMENTS = {"abs", "neg", "sqrt", "pow", "mul", "times"}
 _POLYNOMIAL = {"add", "sub", "mul", "times", "neg", "fma"}

@@ -64,9 +64,7 @@ class Comparison:
         times = np.full(len(states), t)
         self._close_to_flow(times, states, self.system.vector_field(states, times))
 
-    def at_start(
-        self, fun: RightHandSide, y0: np.ndarray, t_span: tuple[float, float], given: Callable[..., Any] | None = None
-    ) -> None:
+    def at_start(self, fun: RightHandSide, y0: np.ndarray, t_span: tuple[float, float], given: Any = None) -> None:
         """Compare at y0 (..., 2d), at states around it, and in the domain; at y0 alone if `given` is remembered."""
         t0 = t_span[0]
         self.at(t0, y0, fun(t0, y0), fun)
@@ -267,10 +265,12 @@ def _drawn(domain: Domain | None, width: int) -> np.ndarray:
     return np.empty((0, width)) if domain is None else domain.sample(N_WITHIN, 20260101)
 
 
-def fixed_step(method: Any, options: dict[str, Any], peer: str) -> FixedStep:
+def fixed_step(method: Any, options: dict[str, Any], peer: str, *systems: Any) -> FixedStep:
     """The fixed-step integrator that `method` and `options` mean; a TypeError where the peer cannot drive it."""
-    from sympflow.integrators.registry import build
+    from sympflow.integrators.registry import build, check_applies
 
+    for what in (type(x).__name__ for x in systems if not isinstance(x, HamiltonianSystem)):
+        raise TypeError(f"`system` must be a HamiltonianSystem; got {what}. See sympflow.interop.systems.")
     integrator = build(method, options)
     if not isinstance(integrator, FixedStep):
         raise TypeError(
@@ -292,6 +292,8 @@ def fixed_step(method: Any, options: dict[str, Any], peer: str) -> FixedStep:
             f"`method` {integrator.name!r} takes steps that are not equal in t, which {peer} cannot drive: use "
             "solve(), or another method."
         )
+    for system in systems:
+        check_applies(integrator, system)
     return integrator
 
 

@@ -240,9 +240,7 @@ class Path:
 class DensePath(Path):
     """A path between two `times` (2,) whose states on the grid are computed once."""
 
-    def __init__(
-        self, integrator: FixedStep, system: HamiltonianSystem | None, y0: Tensor, direction: int, times: Tensor
-    ) -> None:
+    def __init__(self, integrator: FixedStep, system: Any, y0: Tensor, direction: int, times: Tensor) -> None:
         super().__init__(integrator, system, y0, direction, times[0])
         count, _ = self.located(times[1:] - times[0])
         self.span = numbers(times)
@@ -251,9 +249,7 @@ class DensePath(Path):
     def __call__(self, s: Tensor) -> Tensor:
         found, length, slack = numbers(s), self.span[1] - self.span[0], _EPS * np.abs(self.span).max()
         if found.size and not (found.min() >= min(0.0, length) - slack and found.max() <= max(0.0, length) + slack):
-            raise ValueError(
-                f"`t` must lie between {self.span[0]:g} and {self.span[1]:g}, the interval that was solved."
-            )
+            raise ValueError(f"`t` must lie between {self.span[0]:g} and {self.span[1]:g}, the interval solved.")
         return super().__call__(s)
 
     def rollout(self, save: np.ndarray, start: Tensor | None = None, first: int = 0) -> Tensor:
@@ -319,14 +315,12 @@ class _PulledBack(torch.autograd.Function):
     """The states of an `AdjointPath` at the elapsed times s."""
 
     @staticmethod
-    def forward(
-        ctx: Any, path: AdjointPath, s: Tensor, start: Tensor | None, y0: Tensor, *parameters: Tensor
-    ) -> Tensor:
+    def forward(ctx: Any, path: AdjointPath, s: Tensor, start: Tensor | None, y0: Tensor, *weights: Tensor) -> Tensor:
         count, r = path.located(s)
         saved = np.union1d(0, numbers(count))
         grid = path.rollout(saved)
         ctx.path, ctx.saved, ctx.dtype = path, saved, s.dtype
-        ctx.save_for_backward(s, grid, *parameters)
+        ctx.save_for_backward(s, grid, *weights)
         states = grid[_places(saved, count)]
         return path.step(states, _each(r.to(states.dtype), states), path.times(count, states)) if r.any() else states
 

@@ -59,13 +59,7 @@ def as_scipy(method: Any, system: HamiltonianSystem | None = None, **options: An
     >>> solve_ivp(system, (0, 10), system.y0, method=Verlet).y.shape
     (4, 101)
     """
-    if system is not None and not isinstance(system, HamiltonianSystem):
-        raise TypeError(
-            f"`system` must be a HamiltonianSystem; got {type(system).__name__}. See sympflow.interop.systems."
-        )
-    integrator = fixed_step(method, options, "SciPy")
-    if system is not None:
-        check_applies(integrator, system)
+    integrator = fixed_step(method, options, "SciPy", *([] if system is None else [system]))
     return _solver_class(integrator, system)
 
 
@@ -123,13 +117,16 @@ class FlowSolver(OdeSolver, metaclass=_SolverType):
     ) -> None:
         if math.isnan(t0) or math.isnan(t_bound) or math.isinf(t0):
             raise ValueError(f"`t_span` must start at a finite time and end at one or ±inf; got ({t0}, {t_bound}).")
-        _check_first_step(extraneous.get("first_step"), abs(t_bound - t0))
+        first_step = extraneous.get("first_step")  # refused as SciPy's own solvers refuse it, though steps are our own
+        if first_step is not None and not as_float(first_step) > 0:
+            raise ValueError(f"`first_step` must be positive; got {first_step!r}. Leave it out.")
+        if first_step is not None and first_step > (length := abs(t_bound - t0)):
+            raise ValueError(f"`first_step` {first_step:g} exceeds the interval, of length {length:g}. Leave it out.")
         if extraneous:
             own = sorted(set(extraneous) & set(self.integrator.options()))
             remedy = f"leave them out; {', '.join(own)} is an option of as_scipy" if own else "leave them out"
             warn(
                 f"The options {', '.join(sorted(extraneous))} have no effect on a fixed-step method: {remedy}.",
-                UserWarning,
             )
         if not as_float(max_step) > 0:
             raise ValueError(f"`max_step` must be positive; got {max_step!r}.")
@@ -193,14 +190,6 @@ class FlowSolver(OdeSolver, metaclass=_SolverType):
         self._grid, self._k = Grid(start, end, self._length), 0  # the grid, and the point of it before the state
         self._t_anchor, self._next_anchor = start, (start, self.y)
 
-    def _compare_again(self, last: bool) -> None:
-        """Compare at the state, if it is the last or the run is due."""
-        if self._fun is not None and (last or self._comparison.is_due(self._k)):
-            self._comparison.at(self.t, self.y, self._slope(self.t, self.y), self._slope, self._grid.t0)
-            self._count_compared()
-            if last:
-                self._comparison.remember()
-
     def _slope(self, t: float, y: np.ndarray) -> np.ndarray:
         """`fun` in the precision in which it answers."""
         self._counts.others += 1
@@ -256,7 +245,12 @@ class FlowSolver(OdeSolver, metaclass=_SolverType):
             self.t, self.y = self._next_anchor
             if self._k == grid.n_steps + bool(grid.remainder):
                 self.t = self._stop
-            self._compare_again(last=self.t == self.t_bound)
+            last = self.t == self.t_bound
+            if self._fun is not None and (last or self._comparison.is_due(self._k)):
+                self._comparison.at(self.t, self.y, self._slope(self.t, self.y), self._slope, grid.t0)
+                self._count_compared()
+                if last:
+                    self._comparison.remember()
         else:
             h = self._h * self._part / self._parts
             self.t, self.y = self._t_anchor + h, self._shorter(h)
@@ -281,16 +275,6 @@ class FlowSolver(OdeSolver, metaclass=_SolverType):
 
     def _dense_output_impl(self) -> DenseOutput:
         return FlowOutput(self, self._t_anchor, self._anchor)
-
-
-def _check_first_step(first_step: Any, length: float) -> None:
-    """Refuse what SciPy's own solvers refuse, though the steps of the method are its own."""
-    if first_step is None:
-        return
-    if not as_float(first_step) > 0:
-        raise ValueError(f"`first_step` must be positive; got {first_step!r}. Leave it out.")
-    if first_step > length:
-        raise ValueError(f"`first_step` {first_step:g} exceeds the interval, of length {length:g}. Leave it out.")
 
 
 class _Counts:

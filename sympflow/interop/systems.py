@@ -114,7 +114,10 @@ def from_module(module: Callable[[Any, Tensor], Tensor], ndof: int, **scene: Any
         return torch.cat([-force, velocity], dim=-1)
 
     jacobian = torch.func.vmap(torch.func.jacrev(minus_J_f))(probes)
-    asymmetry = _asymmetry(jacobian.detach().numpy())
+    A = jacobian.detach().numpy()
+    beside = np.maximum(np.maximum(np.abs(A), np.abs(A.swapaxes(-1, -2))), _size(A))  # what an entry is compared with
+    rounding = 16 * np.finfo(float).eps * np.abs(A).max()
+    asymmetry = float((np.abs(A - A.swapaxes(-1, -2)) / (beside + rounding / TOLERANCE + 1e-300)).max())
     if asymmetry > TOLERANCE:
         raise ValueError(
             f"`module` is not a Hamiltonian field in y = [q, p]: −J·f' is asymmetric by {asymmetry:.1e}. Check the "
@@ -146,9 +149,7 @@ def from_module(module: Callable[[Any, Tensor], Tensor], ndof: int, **scene: Any
     return _guarded(system, "module", minus_J_f, probes)
 
 
-def _guarded(
-    system: HamiltonianSystem, argument: str, gradient: Callable[[Tensor], Tensor], probes: Tensor
-) -> HamiltonianSystem:
+def _guarded(system: HamiltonianSystem, argument: str, gradient: Any, probes: Tensor) -> HamiltonianSystem:
     """The system, which compares M⁻¹p with ∂H/∂p at one state whenever it is used."""
     d, state = system.ndof, probes[:1]
     expected = system.velocity(state[:, d:])
@@ -188,8 +189,7 @@ def _probes(ndof: int, y0: ArrayLike | None) -> Tensor:
         what = f"shape {center.shape}" if center.shape != (2 * ndof,) else "NaN or infinity"
         raise ValueError(f"`y0` must be {2 * ndof} finite numbers, [q, p] for ndof = {ndof}; got {what}. Correct it.")
     spread = 0.25 * np.maximum(np.abs(center).max(initial=0.0), 1.0)
-    noise = np.random.default_rng(20260101).uniform(-1, 1, (8, 2 * ndof))
-    return torch.from_numpy(center + spread * noise)
+    return torch.from_numpy(center + spread * np.random.default_rng(20260101).uniform(-1, 1, (8, 2 * ndof)))
 
 
 def _mass(hessian: Tensor, gradient: Callable[[Tensor], Tensor], probes: Tensor) -> np.ndarray | None:
@@ -246,13 +246,6 @@ def _size(A: np.ndarray) -> np.ndarray:
     """√(|A_ii| |A_jj|), from the largest of symmetric matrices A (n, 2d, 2d)."""
     root = np.sqrt(np.abs(A.diagonal(axis1=1, axis2=2)).max(0))
     return np.outer(root, root)
-
-
-def _asymmetry(A: np.ndarray) -> float:
-    """The largest |A_ij − A_ji| beside A_ij, A_ji or √(A_ii A_jj), whichever is largest, and beside rounding."""
-    beside = np.maximum(np.maximum(np.abs(A), np.abs(A.swapaxes(-1, -2))), _size(A))
-    rounding = 16 * np.finfo(float).eps * np.abs(A).max()
-    return float((np.abs(A - A.swapaxes(-1, -2)) / (beside + rounding / TOLERANCE + 1e-300)).max())
 
 
 def _clean(M: np.ndarray, units: np.ndarray) -> np.ndarray:

@@ -31,11 +31,8 @@ State = Tensor | tuple[Tensor, ...]
 _THEIRS = {*ADAPTIVE, *FIXED, "explicit_adams", "implicit_adams", "fixed_adams", "scipy_solver"}
 _RTOL, _ATOL = 1e-7, 1e-9
 _CALLBACKS = (  # callbacks of torchdiffeq for adaptive steps and its adjoint equation, which our methods have not
-    "callback_accept_step",
-    "callback_reject_step",
-    "callback_step_adjoint",
-    "callback_accept_step_adjoint",
-    "callback_reject_step_adjoint",
+    *("callback_accept_step", "callback_reject_step", "callback_step_adjoint"),
+    *("callback_accept_step_adjoint", "callback_reject_step_adjoint"),
 )
 _LATE = 1000.0  # time after the start in which an event is expected
 _CHECKPOINTS = 5  # outputs of a run at which another right-hand side is compared
@@ -103,9 +100,7 @@ def _integrated(
 ) -> Any:
     """`odeint` by one of our methods, along a path."""
     if (rtol, atol) != (_RTOL, _ATOL):
-        warn(
-            f"`rtol` and `atol` have no effect on the fixed-step method {_name(method)!r}: leave them out.", UserWarning
-        )
+        warn(f"`rtol` and `atol` have no effect on the fixed-step method {_name(method)!r}: leave them out.")
     direction = _direction(t)
     integrator, system = _build(func, method, options)
     y, pack = _joined(y0)
@@ -263,7 +258,6 @@ def odeint_adjoint(
         warn(
             f"`adjoint_rtol`, `adjoint_atol` and `adjoint_options` have no effect on the fixed-step method "
             f"{_name(method)!r}, whose gradients are exact: leave them out.",
-            UserWarning,
         )
     given = None if adjoint_params is None else tuple(adjoint_params)
     if given is None and isinstance(func, torch.nn.Module):
@@ -306,7 +300,6 @@ def register(method: str) -> None:
         warn(
             f"`method` {method!r} is torchdiffeq's own in this release, and stays so in its table: for ours call "
             "sympflow.interop.torchdiffeq.odeint.",
-            UserWarning,
         )
         return
     table[method] = type(f"{method.title()}Solver", (_Solver,), {"method": method})
@@ -344,9 +337,7 @@ def _is_ours(method: Any, func: Any, options: Any) -> bool:
     return bool(ours) or found is None or issubclass(found, _Solver)
 
 
-def _landing(
-    func: Any, t: Any, method: Any, options: dict[str, Any] | None, endless: bool = False
-) -> dict[str, Any] | None:
+def _landing(func: Any, t: Any, method: Any, options: Any, endless: bool = False) -> dict[str, Any] | None:
     """Options with which a method of torchdiffeq ends steps where a HamiltonianSystem jumps in t."""
     known, name = dict(options or {}), method or "dopri5"
     if not isinstance(func, HamiltonianSystem) or func.autonomous or not isinstance(t, Tensor) or not t.numel():
@@ -386,12 +377,10 @@ def _with_jumps(t: Tensor, length: float | None, jumps: np.ndarray) -> Tensor:
     if length is not None:
         n_steps = math.ceil(float(abs(t[-1] - t[0])) / length)
         grid = torch.cat([t[0] + torch.arange(n_steps).to(t) * torch.sign(t[-1] - t[0]) * length, t[-1:]])
-    found = torch.as_tensor(jumps).to(t)
+    at = torch.as_tensor(jumps).to(t)
     near = 1e-9 * (grid[1:] - grid[:-1]).abs().min()
-    apart = ((grid[1:-1, None] - found).abs() > near).all(-1)
-    return torch.cat(
-        [grid[:1], torch.cat([grid[1:-1][apart], found]).sort(descending=bool(t[-1] < t[0]))[0], grid[-1:]]
-    )
+    apart = ((grid[1:-1, None] - at).abs() > near).all(-1)
+    return torch.cat([grid[:1], torch.cat([grid[1:-1][apart], at]).sort(descending=bool(t[-1] < t[0]))[0], grid[-1:]])
 
 
 def _name(method: Any) -> str:
@@ -435,15 +424,12 @@ def _direction(t: Any) -> int:
     return -1 if steps.size and steps.flat[0] < 0 else 1
 
 
-def _announced(
-    func: Any, y0: Tensor, t: Tensor, pack: Callable[[Tensor], Any], integrator: FixedStep
-) -> BeforeStep | None:
+def _announced(func: Any, y0: Tensor, t: Tensor, pack: Any, integrator: FixedStep) -> BeforeStep | None:
     """torchdiffeq's `callback_step`, if `func` has it: called before each step with its time, state and length."""
     others = {name for name in _CALLBACKS if getattr(func, name, None) is not None}
     if others:
         warn(
             f"Method {integrator.name!r} does not support the callbacks {sorted(others)}: only callback_step.",
-            UserWarning,
         )
     callback = getattr(func, "callback_step", None)
     if callback is None:
@@ -482,9 +468,7 @@ def _check_state(y: Tensor, system: HamiltonianSystem | None, integrator: Integr
 class _Compared:
     """Compares `func`, where it is not the system itself, with what the method solves: see `matching.Comparison`."""
 
-    def __init__(
-        self, func: Any, y0: State, t: Tensor, integrator: FixedStep, system: HamiltonianSystem | None
-    ) -> None:
+    def __init__(self, func: Any, y0: State, t: Any, integrator: FixedStep, system: HamiltonianSystem | None) -> None:
         flow = integrator.given_flow
         self.comparison = comparison = Comparison("func", integrator, system, _REMEDY)
         y, self.pack = _joined(y0)

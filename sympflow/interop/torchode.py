@@ -27,7 +27,7 @@ except ImportError as error:  # pragma: no cover
 from sympflow.arrays import to_numpy
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep
-from sympflow.integrators.registry import check_applies, naming_plugin
+from sympflow.integrators.registry import naming_plugin
 from sympflow.interop.matching import Comparison, fixed_step
 
 _REMEDY = "Register the system of the term: register(name, system), and solve_ivp(system, ...)."
@@ -58,15 +58,9 @@ def register(name: str, system: HamiltonianSystem, method: Any = None, **options
 
 def step_method(method: Any, system: HamiltonianSystem, **options: Any) -> SymplecticStep:
     """One of our methods as a torchode `SingleStepMethod`; arguments as for `register`."""
-    if not isinstance(system, HamiltonianSystem):
-        raise TypeError(
-            f"`system` must be a HamiltonianSystem; got {type(system).__name__}. See sympflow.interop.systems."
-        )
     if "dt" in options:
         raise TypeError("`dt` is not an option here: the step length is torchode's `dt0`, one for each sample.")
-    integrator = fixed_step(method, options, "torchode")
-    check_applies(integrator, system)
-    return SymplecticStep(integrator, system)
+    return SymplecticStep(fixed_step(method, options, "torchode", system), system)
 
 
 class Beginning(NamedTuple):
@@ -123,24 +117,13 @@ class SymplecticStep(SingleStepMethod):
     def init(self, term: Any, problem: Any, f0: Tensor | None, *, stats: dict[str, Any], args: Any) -> Run:
         """The state of the method: its run."""
         if problem.n_features != 2 * self.system.ndof:
-            raise ValueError(
-                f"`y0` must have shape (batch, {2 * self.system.ndof}), [q, p]; got {problem.n_features} features."
-            )
+            raise ValueError(f"`y0` must have shape (batch, {2 * self.system.ndof}), [q, p]; got {problem.n_features}.")
         times = to_numpy(torch.stack([problem.t_start, problem.t_end]).detach())
         self.system.check_times(times.min(), times.max())
         return Run(term, problem, self, stats, args)
 
     def step(
-        self,
-        term: Any,
-        running: Tensor,
-        y0: Tensor,
-        t0: Tensor,
-        dt: Tensor,
-        state: Run,
-        *,
-        stats: dict[str, Any],
-        args: Any,
+        self, term: Any, running: Any, y0: Tensor, t0: Tensor, dt: Tensor, state: Run, *, stats: Any, args: Any
     ) -> tuple[StepResult, Beginning, Run, None]:
         left = state.ends - t0.detach()
         # torchode cuts a step away from the end to one of length 0, and would go on for ever

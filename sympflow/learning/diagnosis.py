@@ -16,7 +16,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -218,9 +218,7 @@ def _left(model: Field, data: Trajectories, held: Trajectories, scales: np.ndarr
 # by slopes -----------------------------------------------------------------------------------------------------------
 
 
-def hint(
-    library: Library, smooth: Smooth, data: Trajectories, force: Force | None = None, drives: Sequence[Drive] = ()
-) -> str | None:
+def hint(library: Library, smooth: Smooth, data: Trajectories, force: Any = None, drives: Any = ()) -> str | None:
     """The likeliest reason, none that the model has, why terms do not explain the data, with the remedy; or None."""
     d, scales = data.ndof, data.scales
     smooth = smooth.some(MOST_SLOPES)
@@ -330,20 +328,15 @@ def drive_frequency(X: np.ndarray, smooth: Smooth, scales: np.ndarray, drive: Dr
     most = min(int(2 * smooth.longest / smooth.step), FREQUENCIES)
     frequencies = np.pi / smooth.longest * np.arange(0.5, max(most, 2) / 2, 0.25)
     beside = Rest.of(X, smooth.slopes, scales)
-    pushes = (
-        drive.base.gradient(np.zeros(drive.base.n), smooth.points.T[:d], False, True).by_parameters
-        / scales[d:, None, None]
-    )
+    pushes = drive.base.gradient(np.zeros(drive.base.n), smooth.points.T[:d], False, True).by_parameters
+    pushes = pushes / scales[d:, None, None]
     terms = np.einsum("ikn,ni->nk", pushes, beside.left.reshape(len(X), -1)[:, d:])
     power = np.abs(np.exp(-1j * frequencies[:, None] * smooth.times) @ terms) ** 2 / (pushes**2).sum(axis=(0, 2))
-
     likely = frequencies[np.unique(power.argmax(axis=0))].tolist()
     return _refined(X, smooth, scales, drive, likely, 0.5 * np.pi / smooth.longest)
 
 
-def _refined(
-    X: np.ndarray, smooth: Smooth, scales: np.ndarray, drive: Drive, likely: Sequence[float], near: float
-) -> float:
+def _refined(X: np.ndarray, smooth: Smooth, scales: Any, drive: Drive, likely: Sequence[float], near: float) -> float:
     """The angular frequency of a drive that leaves least, near the best of those that are likely."""
     beside = Rest.of(X, smooth.slopes, scales)
 
@@ -355,9 +348,7 @@ def _refined(
     return float(found.x if found.fun < rest(best) else best)
 
 
-def driven(
-    X: np.ndarray, smooth: Smooth, scales: np.ndarray, drive: Drive, known: Sequence[Drive] = ()
-) -> tuple[float, list[float]]:
+def driven(X: Any, smooth: Smooth, scales: Any, drive: Drive, known: Sequence[Drive] = ()) -> tuple[float, list[float]]:
     """The share of other trajectories' squares that drives leave, infinite of a single trajectory, and their ω."""
     first, v, near = smooth.owner % 2 == 0, smooth.slopes, 0.5 * np.pi / smooth.longest
 

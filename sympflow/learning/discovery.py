@@ -356,9 +356,7 @@ def discover(
         return _of_flow(data, terms, degree, most_terms, domain, seed, name)
     trajectories = Trajectories.read(data, ndof, **reading)
     if trajectories.velocities:
-        raise ValueError(
-            '`observed` must be "qp" for `discover`: pass `velocity_mass`, or learn the masses by `learn`.'
-        )
+        raise ValueError('`observed` must be "qp" for `discover`: pass `velocity_mass`, or find the masses by `learn`.')
     trajectories.check_moving()
     period = reading.get("period")
     trajectories.check_angles(None if period is None else np.isinf(periods_of(period, trajectories.ndof)))
@@ -444,8 +442,7 @@ class _Search:
         self.floor = FLOOR * data.scales
         self.penalty = math.log(max(data.n_values, 3)) + 2 * math.log(K)
         self.rate = float(np.sqrt(np.mean((self.smooth.slopes / data.scales) ** 2)))
-        longest = max(run.span for run in data.runs)
-        self.rate = max(self.rate, 1e-3 / longest)
+        self.rate = max(self.rate, 1e-3 / max(run.span for run in data.runs))
         self.piece = RADIANS / self.rate if piece is None else piece
         self.refined = 0
         self._begin()

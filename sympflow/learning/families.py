@@ -295,22 +295,17 @@ def families(constraints: Constraints, name: str | None) -> list[str]:
     if name is not None and name not in FAMILIES:
         raise ValueError(f"`family` {name!r} is unknown: choose from {', '.join(FAMILIES)}, or leave it out.")
     if name is not None and constraints.separable and not FAMILIES[name].separable:
-        raise ValueError(
-            f"`family` {name!r} is of functions H(q, p), not separable: leave out `separable` or `family`."
-        )
-    if constraints.frequencies and (constraints.separable is False or (name and not FAMILIES[name].separable)):
+        raise ValueError(f"`family` {name!r} is of H(q, p), not separable: leave out `separable` or `family`.")
+    whole = constraints.separable is False or (name and not FAMILIES[name].separable)  # an H(q, p) is asked for
+    if constraints.frequencies and whole:
         raise ValueError("`drive` is of a separable H: leave out `separable`, or the `family`.")
     if constraints.frequencies and constraints.force is drags:
         raise ValueError("`drive` is learned beside friction, not beside drag: pass damping=True, or leave it out.")
     if constraints.frequencies and not all(_kicks(part, constraints.ndof) for part in constraints.known):
         raise ValueError("`drive` is of H = ½ pᵀM⁻¹p + V(q, t), which `known` does not fit: leave out one of them.")
-    if constraints.inverse_mass is not None and (
-        constraints.separable is False or (name and not FAMILIES[name].separable)
-    ):
+    if constraints.inverse_mass is not None and whole:
         raise ValueError("`mass` is of T = ½ pᵀM⁻¹p in a separable H: leave out one of them.")
-    if name is not None and not (
-        FAMILIES[name].tells(constraints) and any(True for _ in FAMILIES[name].models(constraints))
-    ):
+    if name is not None and not (FAMILIES[name].tells(constraints) and next(FAMILIES[name].models(constraints), None)):
         raise ValueError(
             f"`family` {name!r} does not apply: series need the `period` of an angle, pairs the coordinates of two "
             "bodies or more in two or three dimensions, central fields those of one, functions H(q, p) and flows "
@@ -332,10 +327,8 @@ def _kicks(part: Fixed, ndof: int) -> bool:
 
 def with_unit_mass(candidate: Candidate, constraints: Constraints) -> Candidate | None:
     """The same model with T = ½ p²; None if its T is not learned."""
-    parts = candidate.model.parts
-    if not any(part.of == "p" and part.n for part in parts) or (
-        not candidate.model.nystrom and not candidate.model.forces
-    ):
+    model, parts = candidate.model, candidate.model.parts
+    if not any(part.of == "p" and part.n for part in parts) or not (model.nystrom or model.forces):
         return None
     rest = tuple(part for part in parts if part.of != "p")
     kind = candidate.name.replace("T = ½ pᵀM⁻¹p", "T = ½ p²")

@@ -221,7 +221,8 @@ def library_for(terms: Any, ndof: int, degree: int, states: np.ndarray) -> tuple
     given = list(given)
     if not given:
         raise ValueError(f"`terms` is an empty list: name terms, or some of {', '.join(LIBRARIES)}, or leave it out.")
-    near, finite = _near_the_centre(states[:, :ndof]), distances(ndof)[4:]  # r, which has no pole
+    r = np.linalg.norm(states[:, :ndof], axis=1) if ndof > 1 else states[:, 0]
+    near, finite = r.min() < NEAR * np.abs(states[:, :ndof]).max(), distances(ndof)[4:]  # r, which has no pole
     expressions: list[sp.Expr] = []
     named: set[sp.Expr] = set()
     for term in given:
@@ -236,11 +237,6 @@ def library_for(terms: Any, ndof: int, degree: int, states: np.ndarray) -> tuple
     whole = Library(expressions, ndof)
     kept = _independent(whole, states, named)
     return whole.subset(kept), tuple(f for k, f in enumerate(expressions) if k not in kept)
-
-
-def _near_the_centre(q: np.ndarray) -> bool:
-    r = q[:, 0] if q.shape[1] == 1 else np.linalg.norm(q, axis=1)
-    return bool(r.min() < NEAR * np.abs(q).max())
 
 
 def _read(term: Any, ndof: int) -> sp.Expr:
@@ -271,9 +267,7 @@ def _independent(library: Library, states: np.ndarray, named: set[sp.Expr]) -> l
         length = np.linalg.norm(column)
         if not np.isfinite(length):
             if library.expressions[k] in named:
-                raise ValueError(
-                    f"`terms` has {library.expressions[k]}, which is not finite at the data: leave it out."
-                )
+                raise ValueError(f"`terms` has {library.expressions[k]}, not finite at the data: leave it out.")
             continue
         rest = column - basis @ (basis.T @ column)
         rest -= basis @ (basis.T @ rest)

@@ -31,9 +31,7 @@ class OwnSteps(Stepper):
     longest: float
     cost = 1.0
 
-    def step(
-        self, model: Any, theta: np.ndarray, x: np.ndarray, X: np.ndarray | None, h: np.ndarray, t: np.ndarray
-    ) -> Any:
+    def step(self, model: Any, theta: np.ndarray, x: np.ndarray, X: Any, h: np.ndarray, t: np.ndarray) -> Any:
         return model.psi(theta, h, x, X)
 
     def orbit(self, over: Over, x: np.ndarray, X: np.ndarray | None, gaps: np.ndarray, t: np.ndarray) -> Orbit:

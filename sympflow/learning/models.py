@@ -205,9 +205,7 @@ class Model(VectorField):
     @property
     def lagrangian(self) -> bool:
         """True if Lagrange's equations of motion are linear in θ though the vector field is not."""
-        return any(part.inertial for part in self.parts) and all(
-            part.inertial or (part.of == "q" and part.linear) for part in self.parts
-        )
+        return any(p.inertial for p in self.parts) and all(p.inertial or (p.of == "q" and p.linear) for p in self.parts)
 
     def momenta(self, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """p and p' by Lagrange's equations for θ = 0, and their derivatives by θ, without those of forces."""

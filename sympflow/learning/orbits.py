@@ -18,6 +18,7 @@ from sympflow.learning.reading import Run
 from sympflow.learning.trajectories import Trajectories
 from sympflow.schemes import Scheme, scheme_named
 
+Array = np.ndarray
 Field = Model | FreeField  # a vector field with numbers θ
 
 MOST_NUMBERS = 2**20  # of the derivatives of a batch, which then stay in the cache
@@ -28,9 +29,9 @@ SOLVED = 1e-4  # of the error of a scheme, to which its equations are solved
 # orbits with their derivatives ----------------------------------------------------------------------------------------
 
 
-Orbit = Iterator[tuple[np.ndarray, np.ndarray | None]]
+Orbit = Iterator[tuple[Array, Array | None]]
 """States (2d, N) and derivatives (2d, c, N) at one point after another."""
-Over = Callable[[np.ndarray, np.ndarray | None, np.ndarray, np.ndarray], Any]
+Over = Callable[[Array, Array | None, Array, Array], Any]
 """States and derivatives at the end of gaps (N,), by those at their beginnings t (N,)."""
 
 
@@ -40,17 +41,15 @@ class Stepper(ABC):
     cost: float  # cost of a step, in evaluations of the force with its derivatives
     longest: float | None = None  # Δt of a map that is fitted itself, whose steps have no error; None of a scheme
 
-    def within(self, tolerance: np.ndarray) -> Stepper:
+    def within(self, tolerance: Array) -> Stepper:
         """The same scheme, whose equations are solved no better than is needed for an error (2d,) of a step."""
         return self
 
     @abstractmethod
-    def step(
-        self, model: Field, theta: np.ndarray, x: np.ndarray, X: np.ndarray | None, h: np.ndarray, t: np.ndarray
-    ) -> Any:
+    def step(self, model: Field, theta: Array, x: Array, X: Array | None, h: Array, t: Array) -> Any:
         """The states (2d, N) and derivatives (2d, c, N), by the start, then by θ, a time h (N,) after x and X at t."""
 
-    def orbit(self, over: Over, x: np.ndarray, X: np.ndarray | None, gaps: np.ndarray, t: np.ndarray) -> Orbit:
+    def orbit(self, over: Over, x: Array, X: Array | None, gaps: Array, t: Array) -> Orbit:
         """States and derivatives after each of the gaps (k, N) between points; the first gap follows t (N,)."""
         for gap in gaps:
             if gap.any():
@@ -69,9 +68,7 @@ class Splitting(Stepper):
     def cost(self) -> float:  # type: ignore[override]
         return float(self.scheme.force_evaluations)
 
-    def step(
-        self, model: Field, theta: np.ndarray, x: np.ndarray, X: np.ndarray | None, h: np.ndarray, t: np.ndarray
-    ) -> Any:
+    def step(self, model: Field, theta: Array, x: Array, X: Array | None, h: Array, t: Array) -> Any:
         d = model.ndof
         q, p = slice(0, d), slice(d, 2 * d)
         wanted = X is not None, X is not None and X.shape[1] > 2 * d
@@ -85,7 +82,7 @@ class Splitting(Stepper):
         return x, X
 
     @staticmethod
-    def _push(f: Linear, w: np.ndarray, x: np.ndarray, X: np.ndarray | None, of: slice, moved: slice) -> None:
+    def _push(f: Linear, w: Array, x: Array, X: Array | None, of: slice, moved: slice) -> None:
         """Add w f of some coordinates to others, and its derivatives."""
         x[moved] += w * f.value
         if X is None or f.slope is None:
@@ -111,22 +108,20 @@ class Gauss(Stepper):
 
     stages: int
     iterations: int = 60
-    tolerance: np.ndarray | float = field(default=0.0, compare=False)
+    tolerance: Array | float = field(default=0.0, compare=False)
 
     @property
     def cost(self) -> float:  # type: ignore[override]
         return 4.0 * self.stages
 
     @cached_property
-    def _table(self) -> tuple[np.ndarray, np.ndarray]:
+    def _table(self) -> tuple[Array, Array]:
         return _gauss_table(self.stages)
 
-    def within(self, tolerance: np.ndarray) -> Gauss:
+    def within(self, tolerance: Array) -> Gauss:
         return replace(self, tolerance=SOLVED * tolerance)
 
-    def step(
-        self, model: Field, theta: np.ndarray, x: np.ndarray, X: np.ndarray | None, h: np.ndarray, t: np.ndarray
-    ) -> Any:
+    def step(self, model: Field, theta: Array, x: Array, X: Array | None, h: Array, t: Array) -> Any:
         A, b = self._table
         m, N = x.shape
         s = self.stages
@@ -162,7 +157,7 @@ class Gauss(Stepper):
 
 
 @lru_cache
-def _gauss_table(s: int) -> tuple[np.ndarray, np.ndarray]:
+def _gauss_table(s: int) -> tuple[Array, Array]:
     """A and b of Gauss's collocation with s stages."""
     nodes, weights = np.polynomial.legendre.leggauss(s)
     c, b = (nodes + 1) / 2, weights / 2
@@ -181,8 +176,7 @@ def steppers(model: Field) -> list[Stepper]:
         return [model.stepper]
     if not model.separable:
         return [Gauss(s) for s in STAGES]
-    schemes = map(scheme_named, SPLITTINGS)
-    return [Splitting(s) for s in schemes if model.nystrom or not s.nystrom]
+    return [Splitting(s) for s in map(scheme_named, SPLITTINGS) if model.nystrom or not s.nystrom]
 
 
 @dataclass(frozen=True)
@@ -192,22 +186,18 @@ class Method:
     stepper: Stepper
     longest: float
 
-    def steps(self, gaps: np.ndarray) -> int:
+    def steps(self, gaps: Array) -> int:
         """How many steps lead over gaps (N,)."""
         return max(1, math.ceil(float(np.max(np.abs(gaps), initial=0.0)) / self.longest * (1 - 1e-9)))
 
-    def over(
-        self, model: Field, theta: np.ndarray, x: np.ndarray, X: np.ndarray | None, gaps: np.ndarray, t: np.ndarray
-    ) -> Any:
+    def over(self, model: Field, theta: Array, x: Array, X: Array | None, gaps: Array, t: Array) -> Any:
         """States and derivatives at the end of gaps that begin at t."""
         n = self.steps(gaps)
         for k in range(n):
             x, X = self.stepper.step(model, theta, x, X, gaps / n, t + k * gaps / n)
         return x, X
 
-    def orbit(
-        self, model: Field, theta: np.ndarray, x: np.ndarray, X: np.ndarray | None, gaps: np.ndarray, t: np.ndarray
-    ) -> Orbit:
+    def orbit(self, model: Field, theta: Array, x: Array, X: Array | None, gaps: Array, t: Array) -> Orbit:
         """States and derivatives after each of the gaps (k, N) between points; the first gap follows t (N,)."""
         return self.stepper.orbit(partial(self.over, model, theta), x, X, gaps, t)
 
@@ -219,11 +209,11 @@ class Method:
 class Batch:
     """Pieces of trajectories of about one length, side by side."""
 
-    index: np.ndarray  # (N,): Their places among all pieces
-    gaps: np.ndarray  # (k, N): Times from one point to the next, the first of them 0; 0 beyond a piece's end
-    y: np.ndarray  # (k, 2d, N): 0 where nothing was observed
-    seen: np.ndarray  # (k, 2d, N): 1 where there is an observation, 0 elsewhere
-    starts: np.ndarray  # (N,): Their first times
+    index: Array  # (N,): Their places among all pieces
+    gaps: Array  # (k, N): Times from one point to the next, the first of them 0; 0 beyond a piece's end
+    y: Array  # (k, 2d, N): 0 where nothing was observed
+    seen: Array  # (k, 2d, N): 1 where there is an observation, 0 elsewhere
+    starts: Array  # (N,): Their first times
 
 
 def batches(runs: Sequence[Run], columns: int) -> list[Batch]:
@@ -251,7 +241,7 @@ def batches(runs: Sequence[Run], columns: int) -> list[Batch]:
     return made
 
 
-def first_states(data: Trajectories, model: VectorField | None = None, theta: Any = None) -> np.ndarray:
+def first_states(data: Trajectories, model: VectorField | None = None, theta: Any = None) -> Array:
     """A guess of the initial states (N, 2d): what was observed first, interpolated where a value is missing."""
     values = np.concatenate([run.y for run in data.runs], axis=1)
     middle = np.nanmean(np.where(np.isnan(values).all(axis=1, keepdims=True), 0.0, values), axis=1)
@@ -276,7 +266,7 @@ def _first_slope(run: Run, i: int) -> float:
     return float(np.linalg.lstsq(powers, y, rcond=None)[0][1] / t[-1])
 
 
-def integrals(t: np.ndarray, rates: np.ndarray) -> np.ndarray:
+def integrals(t: Array, rates: Array) -> Array:
     """The integrals of rates (…, k) from the first time on, by cubic splines where there are points for them."""
     if not np.isfinite(rates).all():
         return np.full_like(rates, np.nan)

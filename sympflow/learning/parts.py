@@ -126,7 +126,8 @@ class Polynomial(Sum):
     """Σ_m θ_m Π_i (x_i/s_i)^m_i, of exponents m (n, m) and scales s (m,), of the size of the data: θ are comparable."""
 
     def __init__(self, of: str, exponents: Any, scales: Any) -> None:
-        self.of, self.exponents, self.scales = of, np.asarray(exponents, dtype=int), np.asarray(scales, dtype=float)
+        self.of, self.scales = of, np.asarray(scales, dtype=float)
+        self.exponents = np.asarray(exponents, dtype=int).reshape(-1, len(self.scales))
         self.n = len(self.exponents)
         self.quadratic = bool((self.exponents.sum(axis=1) == 2).all())
 
@@ -137,8 +138,7 @@ class Polynomial(Sum):
     @classmethod
     def up_to(cls, degree: int, of: str, scales: Any) -> Polynomial:
         """All monomials of degree 1 to `degree`."""
-        m = len(scales)
-        exponents = [e for e in product(range(degree + 1), repeat=m) if 0 < sum(e) <= degree]
+        exponents = [e for e in product(range(degree + 1), repeat=len(scales)) if 0 < sum(e) <= degree]
         return cls(of, sorted(exponents, key=lambda e: (sum(e), e[::-1])), scales)
 
     @cached_property
@@ -195,9 +195,7 @@ class Polynomial(Sum):
 
     def expression(self, theta: np.ndarray, x: Sequence[sympy.Symbol]) -> sympy.Expr:
         terms = zip(self.coefficients(theta), self.exponents.tolist(), strict=True)
-        return sympy.Add(
-            *(sympy.Float(c, 17) * sympy.Mul(*(v**e for v, e in zip(x, m, strict=True))) for c, m in terms if c)
-        )
+        return sympy.Add(*(_float(c) * sympy.Mul(*(v**e for v, e in zip(x, m, strict=True))) for c, m in terms if c))
 
 
 def kinetic(scales: Any) -> Polynomial:
@@ -256,9 +254,7 @@ class Waves(Sum):
         return self.waves.shape[1]
 
     @classmethod
-    def up_to(
-        cls, harmonics: int, degree: int, of: str, scales: Any, periods: np.ndarray, constant: bool = False
-    ) -> Waves:
+    def up_to(cls, harmonics: int, degree: int, of: str, scales: Any, periods: Any, constant: bool = False) -> Waves:
         """Harmonics of the angles to this order, times powers of the others; the constant first if asked for."""
         angles = np.isfinite(periods)
         span = [range(-harmonics, harmonics + 1) if angle else (0,) for angle in angles]
@@ -401,9 +397,7 @@ class Network(Part):
         inputs = []
         for i, kind in self.inputs:
             angle = _float(2 * np.pi / self.periods[i]) * x[i]
-            inputs.append(
-                x[i] / _float(self.scales[i]) if kind == "line" else (sympy.cos if kind == "cos" else sympy.sin)(angle)
-            )
+            inputs.append(x[i] / _float(self.scales[i]) if kind == "line" else getattr(sympy, kind)(angle))
         made = []
         for weight, row, bias in zip(w, a, b, strict=True):
             sum_ = sympy.Add(_float(bias), *(_float(c) * z for c, z in zip(row, inputs, strict=True)))

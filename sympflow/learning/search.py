@@ -130,8 +130,7 @@ def replica(common: tuple[Model, Trajectories, Setting, np.ndarray, int], number
 def without_growth(found: Fitted) -> Fitted:
     """The fit with rates of friction that are not negative; one that is more than chance is told."""
     model, theta = found.model, found.theta
-    first = model.n - model.forces
-    growing = np.arange(model.n) >= np.where(theta < 0, first, model.n)
+    growing = np.arange(model.n) >= np.where(theta < 0, model.n - model.forces, model.n)
     if not growing.any():
         return found
     errors = np.sqrt(np.diag(found.fit.covariance()))
@@ -176,7 +175,7 @@ class Search:
     setting: Setting
     seed: int
     history: list[dict[str, Any]] = field(default_factory=list)
-    best: Chosen | None = None
+    best: Any = None  # The chosen model, as it was fitted without the held-out trajectories; None before there is one
     identity: dict[str, Any] = field(default_factory=dict)
     done: dict[str, dict[str, Any]] = field(default_factory=dict)
     """The numbers of the models that were fitted, by their names."""
@@ -205,15 +204,9 @@ class Search:
         return min(data.n_values - 2 * data.ndof * len(data.runs) for data, _ in self.folds)
 
     @property
-    def winner(self) -> Chosen:
-        """The chosen model, as it was fitted without the held-out trajectories."""
-        assert self.best is not None
-        return self.best
-
-    @property
     def reason(self) -> str:
         """Why this model."""
-        held = self.winner[2]
+        held = self.best[2]
         others = len({record["model"] for record in self.history}) - 1
         because = (
             "its residuals on held-out trajectories are no more than rounding"
@@ -237,7 +230,7 @@ class Search:
         with session.bar(sum(len(group.models) for group in groups), "Models") as self.bar:
             queue = self._ask(groups, setting, session)
             if self.best is not None:
-                self.final, self.cut = self.winner[1], deadline.over()
+                self.final, self.cut = self.best[1], deadline.over()
                 return
             for place, (linear, candidates) in enumerate(queue):
                 if self.best is not None and (self.best[2].explained or deadline.over()):
@@ -252,14 +245,14 @@ class Search:
                 "states have: give longer trajectories, or more of them."
             )
         if not deadline.over():
-            candidate, found, _ = self.winner
+            candidate, found, _ = self.best
             precision = found.fit.normal.precision()
             self._simplify(pruned(candidate, found.theta, precision, self.data.n_values), setting, session)
         if not deadline.over():
-            self._simplify(with_unit_mass(self.winner[0], self.constraints), setting, session)
-        candidate, self.final, _ = self.winner
+            self._simplify(with_unit_mass(self.best[0], self.constraints), setting, session)
+        candidate, self.final, _ = self.best
         if not deadline.over():
-            smooth = replace(setting, seen=None) if self.winner[2].lag else setting
+            smooth = replace(setting, seen=None) if self.best[2].lag else setting
             found = fitting.refitted(self.final, self.whole or self.all, smooth, longer=True)
             shorter = found.span < self.final.span or not math.isfinite(found.fit.cost)
             self.final = self.final if setting.stop() and shorter else found
@@ -373,7 +366,7 @@ class Search:
         """Fit the best model with fewer numbers, and take that unless what it explains less is worth them."""
         if candidate is None:
             return
-        rich, simple = self.winner, self._fit(candidate, setting, session)
+        rich, simple = self.best, self._fit(candidate, setting, session)
         fewer = rich[0].model.n - candidate.model.n
         lost = 2 * (simple[1].loss(rich[1].sigma) - rich[1].loss(rich[1].sigma))
         if self.late():
@@ -397,9 +390,9 @@ class Search:
 
     def diagnose(self, session: Session) -> None:
         """Warn where the residuals of the best model are no noise, with what may be the reason."""
-        candidate, _, held = self.winner
+        candidate, _, held = self.best
         if held.explained:
-            share = float(np.min(self.winner[1].sigma / self.data.scales))
+            share = float(np.min(self.best[1].sigma / self.data.scales))
             if share > fitting.SILENT:
                 warn(
                     f"The best model, {candidate.name}, explains next to nothing: the noise that it leaves is "
@@ -437,7 +430,7 @@ class Search:
         if self.cut:
             otherwise = f"The time budget ended the search: give it more. {otherwise}"
         library = library_for(None, self.data.ndof, 4, smooth.points)[0]
-        drives = [self.constraints.driven(w) for w in candidate.model.frequencies(self.winner[1].theta)]
+        drives = [self.constraints.driven(w) for w in candidate.model.frequencies(self.best[1].theta)]
         found = diagnosis.hint(library, smooth, self.data, self.constraints.force, drives)
         warn(f"{said} {found or otherwise}")
 
@@ -451,7 +444,7 @@ class Search:
         """The same by one division of the trajectories: a difference as large as is asked for needs no more."""
         if self.reading is not None:
             return self._beside(self.reading, setting)
-        best, scales = self.winner[0].model, self.data.scales
+        best, scales = self.best[0].model, self.data.scales
         damped = [] if best.forces or not isinstance(best, Model) else diagnosis.forced(best)[:1]
         free = [r for r in (diagnosis.free_reading(scales, k) for k in (3, 2)) if self._affords_field(r.field)][:1]
         found = (self._beside(r, setting) for r in (*damped, *free) if self._affords_field(r.field))
@@ -460,7 +453,7 @@ class Search:
     def _beside(self, reading: Reading, setting: Setting) -> Freedom | None:
         """A reading beside the best H; None if it does not explain much more."""
         data, others = self.folds[0]
-        scales, rivals = data.scales, [self.winner[0].model]
+        scales, rivals = data.scales, [self.best[0].model]
         if isinstance(reading.field, FreeField):
             rivals.append(self.constraints.whole(Polynomial.up_to(reading.field.degree + 1, "y", scales)))
         fit = fitting.fitted(reading.field, reading.of(data), setting.turned(reading.rows))
@@ -483,7 +476,7 @@ class Search:
     def bootstrap(self, n: int, session: Session) -> Replicas:
         """Fit the chosen model to trajectories that are drawn anew, n times, or two at least until the time is up."""
         setting = self.setting
-        model = self.winner[0].model
+        model = self.best[0].model
         common = model, self.all, setting, self.final.theta, self.seed
         thetas: list[np.ndarray] = []
         for theta in session.each(replica, common, range(n), session.deadline):
@@ -499,7 +492,7 @@ class Search:
     @cached_property
     def unseen(self) -> list[Any]:
         """Functions that are the same along all orbits, and that the chosen model could depend on in any way."""
-        model, d, states = self.winner[0].model, self.data.ndof, self.final.states
+        model, d, states = self.best[0].model, self.data.ndof, self.final.states
         if not np.isfinite(states).all() or (self.final.sigma > fitting.SILENT * self.data.scales).any():
             return []
         q, p = range(d), range(d, 2 * d)
@@ -534,7 +527,7 @@ class Search:
         """Trajectories of states, by the model that was learned where velocities were observed."""
         if not data.velocities:
             return data
-        model, theta = self.winner[0].model, self.winner[1].theta
+        model, theta = self.best[0].model, self.best[1].theta
         runs = zip(data.runs, data.smooth.states, strict=True)
         return replace(data, runs=tuple(Run(run.t, model.states(theta, y)) for run, y in runs), velocities=False)
 
@@ -550,7 +543,7 @@ class Search:
 
     def system(self, name: str) -> HamiltonianSystem:
         """The H that was learned."""
-        found, model = self.final, self.winner[0].model
+        found, model = self.final, self.best[0].model
         domain: Domain
         domain, states = self._domain()
         energies = model.hamiltonian(found.theta, states.T)
@@ -574,7 +567,7 @@ class Search:
     @property
     def _drag(self) -> list[str] | None:
         """The forces of quadratic drag that were learned, in words; None without."""
-        model, rates = self.winner[0].model, self.final.theta
+        model, rates = self.best[0].model, self.final.theta
         if model.forces == 0 or model.force is not drags:
             return None
         p = [f"p{i + 1}" if model.ndof > 1 else "p" for i in range(model.ndof)]
@@ -582,7 +575,7 @@ class Search:
 
     def flow(self, dt: float | None, name: str, session: Session) -> Any:
         """A flow of the H that was learned, or the flow that was fitted itself."""
-        own = self.winner[0].model.flow(self.final.theta)
+        own = self.best[0].model.flow(self.final.theta)
         if own is not None:
             return self._own(own, name)
         system = self.system(name)
@@ -618,7 +611,7 @@ class Search:
 
     @property
     def _learned(self) -> dict[str, Any]:
-        return {"model": self.winner[0].name, "reason": self.reason, "models": self.history}
+        return {"model": self.best[0].name, "reason": self.reason, "models": self.history}
 
     def _own(self, flow: Any, name: str) -> Any:
         """The flow that was fitted itself, with the system of its own Hamiltonian."""
@@ -648,7 +641,7 @@ class Search:
 
     def _collocated(self, system: HamiltonianSystem, dt: float | None) -> FlowMap:
         """Steps of a Gauss method, as many as they take where the data are: no fit comes near their accuracy."""
-        states, model = self._states(), self.winner[0].model
+        states, model = self._states(), self.best[0].model
         states = states[np.random.default_rng(self.seed).permutation(len(states))[:STEPPED]]
         slopes = model.field(self.final.theta, states.T, True, False).slope
         rates = np.abs(np.linalg.eigvals(np.moveaxis(np.broadcast_to(slopes, (*slopes.shape[:2], len(states))), -1, 0)))
@@ -670,12 +663,12 @@ class Search:
     @property
     def noise(self) -> float:
         """The noise of a value that was observed, in the root mean square of all coordinates."""
-        found = self.winner[1]
+        found = self.best[1]
         return float(np.sqrt(np.mean(found.sigma[found.fit.counts > 0] ** 2)))
 
     def figures(self, dt: float) -> dict[str, float]:
         """The figures of the chosen model on the held-out trajectories, before its last fit to all of them."""
-        _, found, held = self.winner
+        _, found, held = self.best
         noise = {name: float(found.sigma[i]) for i, name in enumerate(self.data.names) if found.fit.counts[i]}
         made = {
             "held_out_loss": held.loss,

@@ -93,8 +93,7 @@ class Normal:
     def gains(self, fitted: np.ndarray) -> np.ndarray:
         """Decrease of |r|² (n,) by the linear model, when one number joins those that were fitted; 0 of these."""
         S, g = self.reduced()
-        inner = S[np.ix_(fitted, fitted)]
-        found = np.linalg.solve(inner, np.column_stack([S[fitted], g[fitted]]))
+        found = np.linalg.solve(S[np.ix_(fitted, fitted)], np.column_stack([S[fitted], g[fitted]]))
         curvature = np.diag(S) - np.einsum("ak,ak->k", S[fitted], found[:, :-1])
         slope = g - S[:, fitted] @ found[:, -1]
         usable = ~fitted & (curvature > 1e-10 * np.diag(S))
@@ -291,7 +290,8 @@ class Fit:
 
 def _robust_variances(r: np.ndarray, huber: float) -> np.ndarray:
     """σ² of rows (2d, n) by Huber's proposal 2: the mean of min(r², k²σ²) is that of normal residuals."""
-    expected = _clipped_square(huber)
+    density, inside = math.exp(-huber * huber / 2) / math.sqrt(2 * math.pi), math.erf(huber / math.sqrt(2))
+    expected = inside - 2 * huber * density + huber * huber * (1 - inside)
     made = np.empty(len(r))
     for i, row in enumerate(r):
         squares = row[np.isfinite(row)] ** 2
@@ -302,13 +302,6 @@ def _robust_variances(r: np.ndarray, huber: float) -> np.ndarray:
                 break
         made[i] = variance
     return made
-
-
-def _clipped_square(k: float) -> float:
-    """The mean of min(z², k²) of normal z."""
-    density = math.exp(-k * k / 2) / math.sqrt(2 * math.pi)
-    inside = math.erf(k / math.sqrt(2))
-    return inside - 2 * k * density + k * k * (1 - inside)
 
 
 def minimized(
@@ -427,9 +420,7 @@ def _gaps(data: Trajectories) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")
-def _ends(
-    model: Field, theta: np.ndarray, method: Method, x: np.ndarray, gaps: np.ndarray, t: np.ndarray
-) -> np.ndarray:
+def _ends(model: Field, theta: np.ndarray, method: Method, x: np.ndarray, gaps: Any, t: Any) -> np.ndarray:
     return model.observed(theta, method.over(model, theta, x.copy(), None, gaps, t)[0], None)[0]
 
 
@@ -483,9 +474,7 @@ def _whole(run: Run) -> Run:
 
 
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")
-def _increments(
-    model: Field, theta: np.ndarray, pieces: Sequence[Run], weights: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _increments(model: Field, theta: np.ndarray, pieces: Sequence[Run], weights: Any) -> tuple[np.ndarray, np.ndarray]:
     """The increments less the integrals of the field, and minus their derivative by θ."""
     here = model.at(np.concatenate([run.t for run in pieces]))
     f = here.field(theta, np.concatenate([run.y for run in pieces], axis=1), False, True)

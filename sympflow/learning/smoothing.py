@@ -97,8 +97,7 @@ def _curve(run: Run) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np
         best = np.where(better, error, best)
         states[better], slopes[better] = values[better], rates[better]
     for i, has in enumerate(seen):
-        outside = (run.t < run.t[has][0]) | (run.t > run.t[has][-1])
-        slopes[i, outside] = np.nan
+        slopes[i, (run.t < run.t[has][0]) | (run.t > run.t[has][-1])] = np.nan
     return states, slopes, states[:, 1:-1], slopes[:, 1:-1], run.t[1:-1]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import scipy.linalg
@@ -37,9 +38,7 @@ def unseen(states: np.ndarray, errors: np.ndarray, columns: Sequence[int], part:
     return []
 
 
-def _same(
-    part: Part, x: np.ndarray, errors: np.ndarray, names: list[sp.Symbol], middle: np.ndarray, half: np.ndarray
-) -> list[sp.Expr]:
+def _same(part: Part, x: np.ndarray, errors: Any, names: Any, middle: np.ndarray, half: np.ndarray) -> list[sp.Expr]:
     """The sums of terms of a part, at coordinates (m, N) less their middle, that are the same at all points."""
     centre = (x.min(axis=1) + x.max(axis=1)) / 2
     box = centre[:, None] + half[:, None] * np.random.default_rng(0).uniform(-1, 1, (len(x), SAMPLED))

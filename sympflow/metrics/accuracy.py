@@ -108,15 +108,12 @@ def states_of(reference: object) -> np.ndarray:
     except (TypeError, ValueError):
         states = np.zeros(())
     if states.ndim < 2:
+        what = f"an array of shape {reference.shape}" if isinstance(reference, np.ndarray) else type(reference).__name__
         raise TypeError(
-            f"`reference` must be a Reference, a Solution or an array of states (..., 2d, n); got {_brief(reference)}. "
+            f"`reference` must be a Reference, a Solution or an array of states (..., 2d, n); got {what}. "
             "Leave it out to have one computed."
         )
     return states
-
-
-def _brief(x: object) -> str:
-    return f"an array of shape {np.shape(x)}" if isinstance(x, np.ndarray) else type(x).__name__
 
 
 def time_reversal_error(sol: Solution) -> np.floating | np.ndarray:

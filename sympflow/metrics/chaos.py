@@ -255,9 +255,7 @@ def gali(
     orbits = checked_orbits(system, method, t_span, y0, options, "deviation vectors are followed on")
     check_counts(k=k)
     if not 2 <= k <= 2 * system.ndof:
-        raise ValueError(
-            f"`k` must be from 2 to {2 * system.ndof}, the dimension of the phase space of {system.name!r}; got {k}."
-        )
+        raise ValueError(f"`k` must be from 2 to {2 * system.ndof}, the dimension of phase space; got {k}.")
     return indicator(orbits, int(k), VOLUME, checked_threshold(below), t_eval, deviations, seed, backend)
 
 
@@ -286,12 +284,8 @@ def check_followed(orbits: Orbits) -> None:
     """Raise a ValueError with the reason where deviation vectors of states, or H at these times, are not known."""
     integrator, system = orbits.integrator, orbits.system
     system.check_times(*orbits.t_span)
-    if integrator.keeps or integrator.tangent_holds:
-        what = (
-            f"keeps {integrator.keeps}"
-            if integrator.keeps
-            else f"is differentiated with {integrator.tangent_holds} held"
-        )
+    if held := integrator.keeps or integrator.tangent_holds:
+        what = f"keeps {held}" if integrator.keeps else f"is differentiated with {held} held"
         raise ValueError(
             f"`method` {integrator.name!r} {what}, so that deviation vectors of states are not known: use a splitting "
             "method such as 'kahan_li8', or an implicit one such as 'gauss_legendre6'."
@@ -359,14 +353,7 @@ def _deviations(given: ArrayLike | None, vectors: int, scale: np.ndarray, seed: 
 
 
 def _compiled(
-    kernel: Any,
-    grid: Grid,
-    orbits: Orbits,
-    w0: np.ndarray,
-    scale: np.ndarray,
-    times: np.ndarray,
-    kind: int,
-    below: float,
+    kernel: Any, grid: Grid, orbits: Orbits, w0: Any, scale: np.ndarray, times: np.ndarray, kind: int, below: float
 ) -> _Run:
     counts = np.array([grid.place(t)[0] for t in times], dtype=np.int64)
     save, where = np.unique(counts[counts > 0], return_inverse=True)

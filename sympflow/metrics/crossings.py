@@ -6,7 +6,7 @@ Also the states after whole periods, the crossings of a driven system with the p
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -43,12 +43,7 @@ class Crossings(NamedTuple):
 
 
 def crossings(
-    integrator: Integrator,
-    system: HamiltonianSystem,
-    t_span: tuple[float, float],
-    rows: np.ndarray,
-    plane: Plane,
-    sample: float,
+    integrator: Integrator, system: HamiltonianSystem, t_span: Any, rows: np.ndarray, plane: Plane, sample: float
 ) -> Crossings:
     """All crossings of the trajectories from `rows` (N, 2d), two of one within the time `sample` excepted."""
     if isinstance(integrator, FixedStep) and integrator.on_grid:
@@ -92,12 +87,7 @@ def dividing_step(period: float, longest: float) -> float:
 
 
 def _by_events(
-    integrator: Integrator,
-    system: HamiltonianSystem,
-    t_span: tuple[float, float],
-    rows: np.ndarray,
-    plane: Plane,
-    sample: float,
+    integrator: Integrator, system: HamiltonianSystem, t_span: Any, rows: np.ndarray, plane: Plane, sample: float
 ) -> Crossings:
     """The crossings of trajectories that take steps of their own: events of each."""
 
@@ -142,21 +132,18 @@ class _Search:
             self.search(t, y, h, np.concatenate([y[1:], y_end[None]]))
             to_go = grid.t1 - float(t[-1] + h[-1])
         reached = abs(to_go) < abs(grid.h) / 2 and bool(np.isfinite(y_end).all())
-        status, message = (np.zeros(len(rows), dtype=int), FINISHED) if reached else self._failure(t_span, rows)
+        status, message = np.zeros(len(rows), dtype=int), FINISHED
+        if not reached:  # as `solve` says of the run that could not go on
+            y0, end = rows[0] if len(rows) == 1 else rows, [t_span[1]]
+            sol = solve(self.system, self.integrator, t_span, y0, t_eval=end, on_domain_exit="ignore")
+            status, message = np.broadcast_to(np.asarray(sol.status), len(rows)), sol.message
         return Crossings(*self._located(rows.shape[-1], grid.h), status, message)
-
-    def _failure(self, t_span: tuple[float, float], rows: np.ndarray) -> tuple[np.ndarray, str]:
-        """The status (N,) and the message that `solve` gives the run that could not go on."""
-        y0 = rows[0] if len(rows) == 1 else rows
-        sol = solve(self.system, self.integrator, t_span, y0, t_eval=[t_span[1]], on_domain_exit="ignore")
-        return np.broadcast_to(np.asarray(sol.status), len(rows)), sol.message
 
     def _end(self, grid: Grid, t: np.ndarray, y: np.ndarray, h: np.ndarray) -> np.ndarray:
         """The end (N, 2d) of the last chunk of steps, run again: a single step would differ from it in rounding."""
         n, step = len(y), float(h[-1])
         with np.errstate(all="ignore"):
-            piece = Problem(self.system, float(t[0]), float(t[-1]) + step, y[0])
-            stepper = self.integrator.stepper(piece)
+            stepper = self.integrator.stepper(Problem(self.system, float(t[0]), float(t[-1]) + step, y[0]))
             states, _ = stepper.rollout(y[0], step, n, np.arange(n + 1), float(t[0]))
             end = states[-1] if step == grid.h else stepper.shorter(y[0], step, float(t[0]))
         return np.asarray(end)
@@ -181,9 +168,7 @@ class _Search:
                 self._locate(t, y, h, crossed, part / parts, (part + 1) / parts, before)
             before = after
 
-    def _locate(
-        self, t: np.ndarray, y: np.ndarray, h: np.ndarray, crossed: np.ndarray, a: float, b: float, before: np.ndarray
-    ) -> None:
+    def _locate(self, t: np.ndarray, y: np.ndarray, h: Any, crossed: Any, a: float, b: float, before: Any) -> None:
         """Bisect all crossings together, in the fraction of the step."""
         y, t, h, sign = y[crossed], t[crossed], h[crossed], np.sign(before[crossed])
         low, high = np.full(len(y), a), np.where(sign == 0, a, b)

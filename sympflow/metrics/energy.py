@@ -119,15 +119,11 @@ def energy_drift(sol: Solution, blocks: int = MIN_BLOCKS, relative: bool = True)
     if isinstance(blocks, bool) or not isinstance(blocks, int | np.integer):
         raise TypeError(f"`blocks` must be an integer; got {blocks!r}. Use {MIN_BLOCKS} or more.")
     if blocks < MIN_BLOCKS:
-        raise ValueError(
-            f"`blocks` must be at least {MIN_BLOCKS} for a standard error that means something; got {blocks}."
-        )
+        raise ValueError(f"`blocks` must be at least {MIN_BLOCKS} for a meaningful standard error; got {blocks}.")
     n = len(sol.t)
     lost = failed(sol)
     if n < blocks and not lost.all():
-        raise ValueError(
-            f"`sol` has {n} outputs, fewer than the {blocks} blocks of the fit: ask for more with `t_eval`."
-        )
+        raise ValueError(f"`sol` has {n} outputs, fewer than the {blocks} blocks of the fit: ask for more by `t_eval`.")
     batch = sol.y.shape[:-2]
     if n < blocks:
         infinite = np.full(batch, np.inf)[()]

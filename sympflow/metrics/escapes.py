@@ -125,9 +125,7 @@ def region_of(outside: Any, system: HamiltonianSystem) -> Outside:
     """The function of states that `outside` means; a ValueError or TypeError if it is none."""
     if outside is None:
         if system.domain is None:
-            raise ValueError(
-                f"`outside` is needed, as {system.name!r} has no domain: pass a radius, a domain or a function."
-            )
+            raise ValueError(f"`outside` is needed: {system.name!r} has no domain: pass a radius, domain or function.")
         outside = system.domain
     if real_number(outside):
         if not 0 < outside < np.inf:
@@ -137,9 +135,7 @@ def region_of(outside: Any, system: HamiltonianSystem) -> Outside:
     if contains is not None:
         return lambda y: ~contains(y)
     if not callable(outside):
-        raise TypeError(
-            f"`outside` must be a radius, a domain, or a function of states (..., 2d); got {type(outside).__name__}."
-        )
+        raise TypeError(f"`outside` must be a radius, a domain, or a function of states; got {type(outside).__name__}.")
     return outside
 
 

@@ -158,10 +158,8 @@ def frequencies(
         if not message or (np.asarray(sol.status) < 0).any():
             message = sol.message
     omega, amplitude = (np.concatenate(found) for found in zip(*parts, strict=True))
-    shape = (*orbits.batch, *omega.shape[1:])
-    return Frequencies(
-        omega.reshape(shape), amplitude.reshape(shape), np.concatenate(status).reshape(orbits.batch)[()], message
-    )
+    shape, ended = (*orbits.batch, *omega.shape[1:]), np.concatenate(status).reshape(orbits.batch)[()]
+    return Frequencies(omega.reshape(shape), amplitude.reshape(shape), ended, message)
 
 
 def _sample_times(orbits: Orbits, samples: int | None) -> np.ndarray:
@@ -252,8 +250,7 @@ def _lines_of(z: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
     if known > 1:
         a = _projected(basis, window, z)
         for k in 2 * [*range(known)]:  # each with the others taken off
-            others = z - np.delete(a, k) @ np.delete(basis, k, axis=0)
-            angles[k] = _refined(others, window, s, angles[k])
+            angles[k] = _refined(z - np.delete(a, k) @ np.delete(basis, k, axis=0), window, s, angles[k])
             basis[k] = np.exp(1j * angles[k] * s)
             a = _projected(basis, window, z)
     if known:

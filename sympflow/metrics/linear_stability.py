@@ -155,10 +155,8 @@ def _of_table(scheme: Scheme) -> LinearStability:
             points.append(x)
             values.append(value)
         last = points[-1] + 1
-        while (
-            len(p) > 1 and series.polyval(last, p) * Decimal(1).copy_sign(p[-1]) <= 1
-        ):  # from the last extremum on monotone
-            last *= 2
+        while len(p) > 1 and series.polyval(last, p) * Decimal(1).copy_sign(p[-1]) <= 1:
+            last *= 2  # from the last extremum on it is monotone
         points.append(last)
         values.append(series.polyval(last, p))
         windows = _windows(p, points, values)
@@ -288,9 +286,7 @@ class SmallOscillations:
         return float(self.frequencies.max(initial=0.0))
 
 
-def small_oscillations(
-    system: HamiltonianSystem, y0: np.ndarray, orbit: Callable[[], np.ndarray]
-) -> SmallOscillations | None:
+def small_oscillations(system: HamiltonianSystem, y0: np.ndarray, orbit: Callable[[], Any]) -> SmallOscillations | None:
     """The frequencies about a stable equilibrium, else the largest along an orbit; None if there are none."""
     with np.errstate(all="ignore"):
         try:
@@ -355,13 +351,10 @@ def _quadratic(system: HamiltonianSystem, y0: np.ndarray) -> bool:
     size = float(np.abs(scale * y0).max()) or 1.0
     states = np.concatenate([size * s * rng.standard_normal((8, y0.size)) / scale for s in SCALES])
     hessians = np.asarray(system.hessian(states)) / np.outer(scale, scale)
-    spread = np.abs(hessians - hessians[0]).max()
-    return bool(spread <= 1e-12 * np.abs(hessians[0]).max())
+    return bool(np.abs(hessians - hessians[0]).max() <= 1e-12 * np.abs(hessians[0]).max())
 
 
-def of_method(
-    integrator: Integrator, system: HamiltonianSystem, small: SmallOscillations, longest: float
-) -> LinearStability | None:
+def of_method(integrator: Integrator, system: HamiltonianSystem, small: Any, longest: float) -> LinearStability | None:
     """Return the steps, up to `longest`, at which a method keeps small oscillations of a system bounded.
 
     Exact for kicks and drifts; for another method with steps on a grid its step at the equilibrium is differentiated,

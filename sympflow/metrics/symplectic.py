@@ -89,9 +89,7 @@ def volume_error(sol: Solution, over_time: bool = False) -> np.floating | np.nda
 
 
 def _check_kept(sol: Solution, what: str) -> None:
-    sol.system.check_conservative(
-        f"by which phase-space {what} shrinks and is not kept", "use sympflow.conformal_defect(sol)"
-    )
+    sol.system.check_conservative(f"by which phase-space {what} is not kept", "use sympflow.conformal_defect(sol)")
 
 
 def _hold(series: np.ndarray, ends: np.ndarray, values: np.ndarray, t: np.ndarray) -> None:
@@ -199,9 +197,8 @@ def symplecticity_estimate(sol: Solution, directions: int = 8, seed: int = 0) ->
                 return integrator.step(system, t, z, step)
 
             moved = [to_numpy(jvp(one_step, x, v.expand_as(x))[1]) for v in u]
-            change = _form(np.stack(moved)[i], np.stack(moved)[j]) - _form(u.numpy()[i], u.numpy()[j]).reshape(
-                -1, *[1] * (y.ndim - 1)
-            )
+            before = _form(u.numpy()[i], u.numpy()[j]).reshape(-1, *[1] * (y.ndim - 1))
+            change = _form(np.stack(moved)[i], np.stack(moved)[j]) - before
             squares = change.astype(float) ** 2 / (2 * d)
             mean = np.where(np.isfinite(squares).all(0), squares.mean(0), np.inf)
             value = np.sqrt(mean)

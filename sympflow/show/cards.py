@@ -113,8 +113,7 @@ def legible(text: str) -> str:
     with suppress(UnicodeEncodeError):
         text.encode(encoding)
         return text
-    plain = "".join(SPELLED.get(c) or _spelled(c) for c in text)
-    return plain.encode(encoding, "replace").decode(encoding)
+    return "".join(SPELLED.get(c) or _spelled(c) for c in text).encode(encoding, "replace").decode(encoding)
 
 
 SPELLED = {"…": "...", "µ": "u", "±": "+-", "×": "x", "·": "*", "∞": "inf", "≤": "<=", "≥": ">=", "→": "->"}

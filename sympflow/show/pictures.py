@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -25,7 +25,7 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7
 def trajectory_figure(
     t: np.ndarray,
     y: np.ndarray,
-    energy_error: np.ndarray | None,
+    energy_error: Any,
     title: str,
     kinds: Sequence[str] = KINDS,
     marker: str = "",

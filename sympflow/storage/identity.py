@@ -185,7 +185,8 @@ class _Contents:
         if source is not None:
             return "class", _name(cls), source
         self.python = True
-        members = ((name, value) for name, value in vars(cls).items() if callable(value) or not _is_beside(name))
+        said = {name for name in vars(cls) if name.startswith("__") or name == "_abc_impl"}  # such as __doc__
+        members = ((name, value) for name, value in vars(cls).items() if callable(value) or name not in said)
         return "class", cls.__qualname__, *map(self.of, (type(cls), *cls.__bases__)), *self._items(members)
 
     def _function(self, f: FunctionType) -> Iterable[str]:
@@ -249,11 +250,6 @@ def _name(value: Any) -> str:
 
 def _is_cached(cls: type, name: Any) -> bool:
     return any(isinstance(vars(base).get(name), functools.cached_property) for base in cls.__mro__)
-
-
-def _is_beside(name: str) -> bool:
-    """Return True for the name of a member by which Python tells of a class, such as __doc__, where it is no method."""
-    return name.startswith("__") or name == "_abc_impl"
 
 
 @functools.lru_cache(maxsize=4096)

@@ -238,8 +238,7 @@ class RunStore:
         """Commit the end of the run."""
         known = self.store.fields["status"]
         self.store.write("status", (0,) * len(known.shape), np.broadcast_to(status, known.shape))
-        worst = int(np.min(status))
-        self.commit(place, {"status": worst, "message": message, "ended": 1})
+        self.commit(place, {"status": int(np.min(status)), "message": message, "ended": 1})
 
 
 def _fields(y0: np.ndarray, size: int, n: int = 0) -> dict[str, Field]:

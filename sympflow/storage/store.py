@@ -398,9 +398,7 @@ class Appender:
             self.tails[name] = [rest.copy()]
         self.held -= n_chunks * self.size
 
-    def commit(
-        self, attributes: Mapping[str, Any] | None = None, state: Mapping[str, np.ndarray] | None = None
-    ) -> None:
+    def commit(self, attributes: Mapping[str, Any] | None = None, state: Mapping[str, Any] | None = None) -> None:
         """Write what is in memory, and commit the store with its new length: see `Store.commit`."""
         if self.held:
             k = self.length // self.size

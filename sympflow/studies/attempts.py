@@ -260,9 +260,7 @@ def counted(x: float | None) -> str:
     return f"{x:,.0f}" if x else ""
 
 
-def columns(
-    rows: Sequence[Any], titles: Sequence[str], own: Mapping[str, Callable[[Any], str]] | None = None
-) -> list[Column]:
+def columns(rows: Sequence[Any], titles: Sequence[str], own: Mapping[str, Any] | None = None) -> list[Column]:
     """Columns of these titles, with cells of `CELLS` or of their own."""
     cells, left = CELLS | dict(own or {}), ("method", "backend", "status")
     return [Column(title, [cells[title](row) for row in rows], title in left) for title in titles]
@@ -341,9 +339,7 @@ class Attempt:
         if sol.success and "domain_exit" in stats:
             self.note(f"The state left the flow's domain at t = {stats['domain_exit']:.4g}.")
 
-    def warm_up(
-        self, run: Callable[[Any, tuple[float, float], np.ndarray], object], t: np.ndarray, t0: float, dt: float
-    ) -> None:
+    def warm_up(self, run: Callable[..., Any], t: np.ndarray, t0: float, dt: float) -> None:
         """Compile what the candidate's runs need, and enter the time that it took; `dt` is a step of the system."""
         integrator = self.candidate.integrator
         if integrator is None:

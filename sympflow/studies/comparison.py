@@ -141,7 +141,9 @@ def compare(
         one.run(run)
     if match is not None:
         _match(runs, match, run, system, repeats, say)
-    _note_backends(runs)
+    for one in runs if any(one.row.backend == "compiled" for one in runs) else ():
+        if one.row.backend == "torch":
+            one.note("Runs in eager torch, while others run compiled: the run times are not like for like.")
     ready = [one for one in runs if one.row.status == "ok"]
     say(f"{system.name}: timing")
     times = interleaved([partial(run, one.candidate.integrator) for one in ready], repeats)
@@ -186,15 +188,6 @@ def _identify(system: HamiltonianSystem) -> str:
     return f"{system.name}({params})" if params else system.name
 
 
-def _note_backends(runs: Sequence[Attempt]) -> None:
-    """Say of a flow that runs in eager torch that others run compiled: its run time is not one of the same kind."""
-    if not any(run.row.backend == "compiled" for run in runs):
-        return
-    for run in runs:
-        if run.row.backend == "torch":
-            run.note("Runs in eager torch, while others run compiled: the run times are not like for like.")
-
-
 def _instants(reference: object, t0: float, t1: float, n: int, dt: float) -> np.ndarray:
     """The times that are compared: those of a reference that tells them, else such as meet all phases."""
     if isinstance(reference, Reference | Solution) and len(reference.t) == n:
@@ -202,9 +195,7 @@ def _instants(reference: object, t0: float, t1: float, n: int, dt: float) -> np.
     return attempts.instants(t0, t1, n, dt) if reference is None else np.linspace(t0, t1, n + 1)[1:]
 
 
-def _given(
-    reference: Reference | Solution | ArrayLike, system: HamiltonianSystem, t0: float, y0: np.ndarray, t: np.ndarray
-) -> Reference:
+def _given(reference: Any, system: HamiltonianSystem, t0: float, y0: np.ndarray, t: np.ndarray) -> Reference:
     """The reference that was given, if it is one and fits."""
     if isinstance(reference, Reference | Solution):
         if len(reference.t) != len(t):
@@ -247,8 +238,7 @@ def _errors(
             return None
         for one in runs:
             attempts.accuracy(one, truth)
-        found = [one.row.error for one in runs if one.row.error is not None]
-        target = min(found, default=math.inf) / 100
+        target = min([one.row.error for one in runs if one.row.error is not None], default=math.inf) / 100
         if truth.accuracy is None or given is not None or truth.accuracy <= target:
             break
     for one in runs:
@@ -317,11 +307,7 @@ def tuned(integrator: Integrator, system: HamiltonianSystem, factor: float) -> I
 
 
 def matched(
-    integrator: Integrator,
-    system: HamiltonianSystem,
-    measure: Callable[[Integrator], float],
-    target: float,
-    grows: bool,
+    integrator: Integrator, system: HamiltonianSystem, measure: Callable[[Any], float], target: float, grows: bool
 ) -> tuple[Integrator, float]:
     """Tune an integrator until `measure` is within 5 % of `target`; return the nearest found, and its figure."""
     x, slope = 0.0, (2.0 if grows else -1.0)
@@ -379,15 +365,8 @@ class Comparison(Report):
     columns: ClassVar[tuple[str, ...]] = (
         *("system", "method", "label", "status", "reason", "dt", "tolerance", "backend", "run_time", "run_time_spread"),
         *("compile_time", "force_evaluations", "hessian_evaluations", "error", "energy_error", "balance_error"),
-        *(
-            "energy_drift",
-            "energy_drift_error",
-            "volume_error",
-            "symplecticity_defect",
-            "conformal_defect",
-            "time_reversal_error",
-        ),
-        "training_time",
+        *("energy_drift", "energy_drift_error", "volume_error", "symplecticity_defect", "conformal_defect"),
+        *("time_reversal_error", "training_time"),
     )
 
     system: HamiltonianSystem
@@ -459,10 +438,8 @@ def combined_table(comparisons: Sequence[Comparison], width: int | None = None) 
     several = len(comparisons) > 1
     names = [c.title for c in comparisons for _ in c.rows]
     first = [i == 0 for c in comparisons for i in range(len(c.rows))]
-    columns = [
-        Column("system", [n if f and several else "" for n, f in zip(names, first, strict=True)], left=True),
-        *_columns(rows),
-    ]
+    systems = [n if f and several else "" for n, f in zip(names, first, strict=True)]
+    columns = [Column("system", systems, left=True), *_columns(rows)]
     notes = [
         f"  {f'{name}, ' if several else ''}{row.label}: {row.reason}"
         for name, row in zip(names, rows, strict=True)
@@ -486,7 +463,15 @@ def _upright(columns: Sequence[Column]) -> str:
 
 def _columns(rows: Sequence[Row]) -> list[Column]:
     titles = [title for title in CELLS if title not in ("batch", "rtol", "±", "steps", "leaves domain at t")]
-    return attempts.columns(rows, titles, {"step": _step, "run time": _run_time})
+    own: dict[str, Callable[[Row], str]] = {
+        "step": lambda row: CELLS["step"](row) or f"rtol {CELLS['rtol'](row)}".removesuffix("rtol "),
+        "run time": lambda row: (
+            f"{seconds(row.run_time)} ± {100 * row.run_time_spread / row.run_time:2.0f} %"
+            if row.run_time and row.run_time_spread is not None
+            else ""
+        ),
+    }
+    return attempts.columns(rows, titles, own)
 
 
 def _settings(c: Comparison) -> str:
@@ -497,14 +482,3 @@ def _settings(c: Comparison) -> str:
     if c.reference is not None:
         text += f"; reference: {c.reference.described()}"
     return text
-
-
-def _step(row: Row) -> str:
-    rtol = CELLS["rtol"](row)
-    return CELLS["step"](row) or (f"rtol {rtol}" if rtol else "")
-
-
-def _run_time(row: Row) -> str:
-    if not row.run_time or row.run_time_spread is None:
-        return ""
-    return f"{seconds(row.run_time)} ± {100 * row.run_time_spread / row.run_time:2.0f} %"

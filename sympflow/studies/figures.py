@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -63,9 +62,7 @@ def comparison_figure(comparison: Compared, kind: str = "overview") -> Figure:
     return figure
 
 
-def save_comparison(
-    comparison: Compared, path: str | os.PathLike[str], kind: str = "overview", prefix: str = ""
-) -> list[Path]:
+def save_comparison(comparison: Compared, path: Any, kind: str = "overview", prefix: str = "") -> list[Path]:
     """Save one figure to a file; into a folder the overview saves every kind that was measured. The files written."""
     path = Path(path)
     if path.suffix.lower() in FIGURE_FILES:
@@ -121,7 +118,8 @@ def _energy_panel(ax: Axes, comparison: Compared, styles: dict[str, tuple[str, s
     """|energy error| over time: samples faint, their running maximum bold."""
     for run, sol, series in _series(comparison, "energy"):
         colour = styles[run.row.label][0]
-        t, e = sol.t, np.maximum(_middle(series), ROUNDING_FLOOR)
+        middle = np.median(series.reshape(-1, series.shape[-1]), axis=0)  # of a batch
+        t, e = sol.t, np.maximum(middle, ROUNDING_FLOOR)
         ax.plot(t, e, color=colour, lw=0.4, alpha=0.3, zorder=1)
         order = 3 if run.row.method == "sympflow" else 2
         ax.plot(t, np.fmax.accumulate(e), _dash(run), color=colour, lw=1.6, zorder=order)
@@ -161,11 +159,6 @@ def _series(comparison: Compared, name: str) -> list[tuple[Attempt, Solution, np
 def _dash(run: Attempt) -> str:
     """Leapfrog is dashed: its curves lie on Verlet's."""
     return "--" if run.row.method == "leapfrog" else "-"
-
-
-def _middle(series: np.ndarray) -> np.ndarray:
-    """The median over the trajectories of a batch."""
-    return series if series.ndim == 1 else np.median(series.reshape(-1, series.shape[-1]), axis=0)
 
 
 def _drawable(comparison: Compared) -> tuple[str, ...]:
@@ -342,11 +335,12 @@ def precision_figure(rows: Sequence[Row], heading: str, measure: str = "energy_e
 
 def _precision_curve(ax: Axes, points: Sequence[Row], cost: str, measure: str, style: tuple[str, str]) -> None:
     colour, marker = style
-    known = [
-        (error, cost_there, p.status == "uncertain")
-        for p, error, cost_there in ((p, getattr(p, measure), _cost(p, cost)) for p in points)
-        if error and cost_there and error < LEAST_PRECISE
-    ]
+    known = []
+    for p in points:
+        error, counted = getattr(p, measure), (p.force_evaluations or 0.0) + (p.hessian_evaluations or 0.0)
+        spent = p.run_time if cost == "run_time" else counted
+        if error and spent and error < LEAST_PRECISE:
+            known.append((error, spent, p.status == "uncertain"))
     if not known:
         return
     errors, costs, _ = zip(*known, strict=True)
@@ -354,12 +348,6 @@ def _precision_curve(ax: Axes, points: Sequence[Row], cost: str, measure: str, s
     hollow = [(e, c) for e, c, doubt in known if doubt]
     if measure == "error" and hollow:
         ax.plot(*zip(*hollow, strict=True), marker, color="white", mec=colour, ms=5)
-
-
-def _cost(point: Row, cost: str) -> float:
-    if cost == "run_time":
-        return point.run_time or 0.0
-    return (point.force_evaluations or 0.0) + (point.hessian_evaluations or 0.0)
 
 
 # stability ------------------------------------------------------------------------------------------------------------
@@ -412,9 +400,7 @@ def _shown(row: Row) -> float:
     return LARGEST if error is None or not math.isfinite(error) else min(max(error, SMALLEST), LARGEST)
 
 
-def stability_map(
-    all_rows: Sequence[Row], limits: Mapping[str, Sequence[tuple[float, float]]], missing: Sequence[str]
-) -> Figure:
+def stability_map(all_rows: Sequence[Row], limits: Mapping[str, Any], missing: Sequence[str]) -> Figure:
     """A panel for each method: step against stiffness, coloured by energy error; × where it says nothing."""
     from matplotlib.colors import LogNorm
 
@@ -429,9 +415,8 @@ def stability_map(
         x, y = np.array([r.dt for r in rows]), np.array([r.value for r in rows])
         error = np.array([_shown(r) for r in rows])
         bad = np.array([r.status in ("unstable", "outside") for r in rows])
-        image = ax.scatter(
-            x[~bad], y[~bad], c=np.clip(error[~bad], norm.vmin, norm.vmax), norm=norm, cmap="viridis", marker="s", s=34
-        )
+        shades: dict[str, Any] = {"c": np.clip(error[~bad], norm.vmin, norm.vmax), "norm": norm, "cmap": "viridis"}
+        image = ax.scatter(x[~bad], y[~bad], marker="s", s=34, **shades)
         ax.scatter(x[bad], y[bad], c=UNSTABLE, marker="x", s=22, lw=1.0)
         if line := limits.get(label):
             ax.plot(*zip(*line, strict=True), color="#D55E00", lw=1.4, marker="o" if len(line) == 1 else "", ms=4)
@@ -456,9 +441,7 @@ def stability_map(
 # sections ---------------------------------------------------------------------------------------------------------
 
 
-def section_figure(
-    points: np.ndarray, trajectory: np.ndarray, n_trajectories: int, axes: tuple[str, str], heading: str
-) -> Figure:
+def section_figure(points: np.ndarray, trajectory: np.ndarray, n_trajectories: int, axes: Any, heading: str) -> Figure:
     """Points (n, 2) of a section, each trajectory in a shade of its own."""
     figure = new_figure(4.6, 4.4)
     ax = figure.add_subplot()

@@ -277,10 +277,8 @@ class PoincareSection(Report):
     def rows(self) -> tuple[Any, ...]:
         """One for each crossing: trajectory, t, and the coordinates q1 … pd."""
         Crossing = make_dataclass("Crossing", self.columns, frozen=True)
-        return tuple(
-            Crossing(int(k), float(t), *map(float, y))
-            for k, t, y in zip(self.trajectory, self.t, self.states, strict=True)
-        )
+        found = zip(self.trajectory, self.t, self.states, strict=True)
+        return tuple(Crossing(int(k), float(t), *map(float, y)) for k, t, y in found)
 
     def table(self, limit: int = 20) -> str:
         """The first `limit` crossings as text, and the message if a trajectory failed."""

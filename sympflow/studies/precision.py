@@ -145,9 +145,7 @@ def _batch(system: HamiltonianSystem, batch: int | ArrayLike) -> np.ndarray:
     return states
 
 
-def _sweep(
-    candidate: Candidate, by_name: bool, steps: Sequence[float], tolerances: Sequence[float], size: float
-) -> list[Any]:
+def _sweep(candidate: Candidate, by_name: bool, steps: list[float], tolerances: list[float], size: float) -> list[Any]:
     """The candidate's integrator at each of its steps or tolerances, from coarse to fine; `size` is that of states."""
     integrator = candidate.integrator
     if integrator is None or not by_name or integrator.trained:
@@ -198,11 +196,7 @@ class Conditions:
 
 
 def _measure(
-    conditions: Conditions,
-    swept: list[tuple[Candidate, list[Any]]],
-    repeats: int,
-    budget: float,
-    say: Callable[[str], None],
+    conditions: Conditions, swept: Sequence[Any], repeats: int, budget: float, say: Callable[[str], None]
 ) -> tuple[list[Row], Reference | None]:
     """All points for one set of initial states."""
     scene = f"{conditions.system.name}, {conditions.trajectories} trajectories"
@@ -233,12 +227,15 @@ def _measure(
                 break
     say(f"{scene}: timing")
     again = [p for p in points if p.row.status == "ok" and (p.row.run_time or 0.0) * repeats <= budget]
-    times = interleaved([partial(conditions.run, p.candidate.integrator) for p in again], repeats)
-    for point, run_time in zip(again, times, strict=True):
+    timed = interleaved([partial(conditions.run, p.candidate.integrator) for p in again], repeats)
+    for point, run_time in zip(again, timed, strict=True):
         point.fill(run_time=run_time.median, run_time_spread=run_time.spread, repeats=repeats)
     for point in points:
         if point.sol is not None and (few := point.sol.y0.size // point.sol.y0.shape[-1]) < conditions.trajectories:
-            _scale(point, few, conditions.trajectories)
+            times = {name: getattr(point.row, name) for name in ("run_time", "run_time_spread")}
+            share = conditions.trajectories / few
+            point.fill(**{name: None if x is None else x * share for name, x in times.items()})
+            point.note(f"Timed on {few} trajectories, which the method takes one by one.")
         if point.row.status == "ok" and truth is not None and not (point.row.error or 0.0) >= resolved:
             point.fill(status="uncertain")
     return [point.row for point in points], truth
@@ -263,13 +260,6 @@ def _first(candidate: Candidate, conditions: Conditions, compile_time: float | N
     if conditions.measure in _KEPT:
         point.measure({"energy": _KEPT[conditions.measure]}, ["energy"])
     return point
-
-
-def _scale(point: Attempt, few: int, all_of_them: int) -> None:
-    """Scale the run time of a few trajectories to all of them."""
-    times = {"run_time": point.row.run_time, "run_time_spread": point.row.run_time_spread}
-    point.fill(**{name: None if x is None else x * (all_of_them / few) for name, x in times.items()})
-    point.note(f"Timed on {few} trajectories, which the method takes one by one.")
 
 
 SETTINGS = ("dt", "tolerance")  # settings of a method: the largest that reaches an error is the cheapest
@@ -420,9 +410,8 @@ class WorkPrecision(Report):
         """
         from sympflow.studies.figures import precision_figure
 
-        return precision_figure(
-            self.rows, f"{self.title}, T = {self.t_span[1] - self.t_span[0]:g}", measure or self.measure
-        )
+        t0, t1 = self.t_span
+        return precision_figure(self.rows, f"{self.title}, T = {t1 - t0:g}", measure or self.measure)
 
     def plot(self, path: str | os.PathLike[str] | None = None, measure: str | None = None) -> Figure:
         """The figure, as `figure`; with a path it is also saved."""

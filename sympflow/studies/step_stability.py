@@ -133,14 +133,10 @@ def stability(
     if not family:
         raise ValueError("`system` is an empty sequence: give one system, or several.")
     for one in family:
-        one.check_conservative(
-            "so its energy error says nothing of stability",
-            "study the system without `damping`, or use sympflow.compare",
-        )
-        one.check_autonomous(
-            "so its energy error says nothing of stability",
-            "use sympflow.compare(system, methods), or floquet_multipliers of a periodic orbit",
-        )
+        why = "so its energy error says nothing of stability"
+        one.check_conservative(why, "study the system without `damping`, or use sympflow.compare")
+        remedy = "use sympflow.compare(system, methods), or floquet_multipliers of a periodic orbit"
+        one.check_autonomous(why, remedy)
     unknown = [m for m in metrics if m not in METRICS]
     if isinstance(metrics, str) or unknown:
         raise ValueError(f"`metrics` must be a list of names from {', '.join(METRICS)}; got {metrics!r}.")
@@ -160,21 +156,15 @@ def stability(
             raise ValueError("`t_span` has length zero, so there is nothing to run: choose a later end.")
         starts = initial_states(one, y0)
         small = small_oscillations(one, starts[0], partial(_orbit, one, starts[0], span)) if limits else None
-        for candidate in candidates(methods):
+        for chosen in candidates(methods):
             for dtype in dtypes:
-                say = partial(_say, progress, f"{one.title}: {candidate.label}, {dtype}")
-                study = Study(
-                    one, candidate, dtype, span, starts, tuple(metrics), bound, min_steps, max_steps, say, small
-                )
+                say = partial(_say, progress, f"{one.title}: {chosen.label}, {dtype}")
+                study = Study(one, chosen, dtype, span, starts, tuple(metrics), bound, min_steps, max_steps, say, small)
                 say("")
                 with attempts.any_step():
                     own = [study.row(h) for h in study.lengths(lengths)]
                     rows += own
-                    if (
-                        limits
-                        and study.has_steps
-                        and any(row.status not in ("not applicable", "failed") for row in own)
-                    ):
+                    if limits and study.has_steps and {row.status for row in own} - {"not applicable", "failed"}:
                         found.append(step_limit(study, own))
     return StabilityReport(family, tuple(metrics), float(bound), tuple(rows), tuple(found))
 
@@ -326,7 +316,8 @@ class Study:
         one.fill(dt=h)
         if one.sol is not None:
             with one.noting_warnings():
-                one.fill(energy_error=largest_error(one.sols))
+                worst = [float(np.max(max_energy_error(sol))) for sol in one.sols]
+                one.fill(energy_error=math.inf if any(map(math.isnan, worst)) else max(worst))
             status, words = self.verdict(one)
             one.fill(status=status, reason=f"{one.row.reason} {words}".strip())
         return one
@@ -340,9 +331,7 @@ class Study:
         )
         if left or not worst <= self.bound:
             return ("unstable" if not worst <= self.bound else "outside"), left
-        return (
-            ("stable", "") if worst <= 1 else ("bounded", f"The energy error stays bounded, but reaches {worst:.3g}.")
-        )
+        return ("stable", "") if worst <= 1 else ("bounded", f"The energy error is bounded, but reaches {worst:.3g}.")
 
     def stable(self, h: float) -> tuple[bool, float]:
         """Tell whether all runs with this step stay below the bound and in a flow's domain, and their largest error."""
@@ -375,12 +364,6 @@ def _quiet() -> Iterator[None]:
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore", RuntimeWarning)
         yield
-
-
-def largest_error(sols: Sequence[Solution]) -> float:
-    """The largest energy error over states and outputs, inf where a run failed or is not finite."""
-    worst = [float(np.max(max_energy_error(sol))) for sol in sols]
-    return math.inf if any(math.isnan(x) for x in worst) else max(worst)
 
 
 def domain_exit(sols: Sequence[Solution]) -> float | None:
@@ -745,9 +728,7 @@ class StabilityReport(Report):
         if kind != "map":
             raise ValueError(f"`kind` must be 'steps' or 'map'; got {kind!r}.")
         if len({row.value for row in self.rows}) < 2:
-            raise ValueError(
-                "`kind` 'map' needs several systems that differ in a parameter: pass a family to stability()."
-            )
+            raise ValueError("`kind` 'map' needs several systems that differ in a parameter: pass a family.")
         lines: dict[str, list[tuple[float, float]]] = {}
         for x in self.limits:
             if x.stable is not None and x.unstable and x.value is not None:

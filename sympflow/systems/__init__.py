@@ -45,41 +45,15 @@ if TYPE_CHECKING:
 GROUP = "sympflow.systems"
 """The entry-point group in which a distribution announces its systems: `name = "package.module:factory"`."""
 
-SYSTEMS: dict[str, Callable[..., HamiltonianSystem]] = {  # the built-in scenes by the name that the command line uses
-    "harmonic-oscillator": harmonic_oscillator,
-    "henon-heiles": henon_heiles,
-    "henon-heiles-escape": henon_heiles_escape,
-    "pendulum": pendulum,
-    "pendulum-separatrix": pendulum_separatrix,
-    "double-well": double_well,
-    "quartic": quartic,
-    "kepler": kepler,
-    "three-body": three_body,
-    "outer-solar-system": outer_solar_system,
-    "solar-system": solar_system,
-    "fput": fput,
-    "spring-pendulum": spring_pendulum,
-    "toda-lattice": toda_lattice,
-    "lennard-jones": lennard_jones,
-    "nonseparable": nonseparable,
-    "double-pendulum": double_pendulum,
-    "schwarzschild": schwarzschild,
-    "charged-particle": charged_particle,
-    "damped-oscillator": damped_oscillator,
-    "damped-pendulum": damped_pendulum,
-    "decaying-orbit": decaying_orbit,
-    "driven-pendulum": driven_pendulum,
-    "paul-trap": paul_trap,
-    "duffing": duffing,
-    "fodo-cell": fodo_cell,
-    "kicked": kicked,
-    "wave-equation": wave_equation,
-    "sine-gordon": sine_gordon,
-    "phi4": phi4,
-    "nonlinear-schroedinger": nonlinear_schroedinger,
-    "toda-chain": toda_chain,
-    "fput-beta": fput_beta,
-}
+_BUILT_IN: tuple[Callable[..., HamiltonianSystem], ...] = (
+    *(harmonic_oscillator, henon_heiles, henon_heiles_escape, pendulum, pendulum_separatrix, double_well),
+    *(quartic, kepler, three_body, outer_solar_system, solar_system, fput, spring_pendulum, toda_lattice),
+    *(lennard_jones, nonseparable, double_pendulum, schwarzschild, charged_particle, damped_oscillator),
+    *(damped_pendulum, decaying_orbit, driven_pendulum, paul_trap, duffing, fodo_cell, kicked, wave_equation),
+    *(sine_gordon, phi4, nonlinear_schroedinger, toda_chain, fput_beta),
+)
+SYSTEMS = {f.__name__.replace("_", "-"): f for f in _BUILT_IN}
+"""The built-in scenes by the names that the command line uses."""
 
 _registered: dict[str, Callable[..., HamiltonianSystem]] = {}
 
@@ -147,9 +121,7 @@ def register(name: str, factory: Callable[..., HamiltonianSystem]) -> None:
             "another name."
         )
     if isinstance(factory, HamiltonianSystem) or not _makes_a_default(factory):
-        raise TypeError(
-            f"`factory` must be a function that makes the system, with a default for every parameter; got {factory!r}."
-        )
+        raise TypeError(f"`factory` must make the system, with a default for every parameter; got {factory!r}.")
     _registered[key] = factory
 
 

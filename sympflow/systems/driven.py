@@ -237,9 +237,7 @@ def _dividing(period: float, longest: float) -> float:
 
 def _not_zero(name: str, value: float) -> float:
     if checked_number(name, value) == 0:
-        raise ValueError(
-            f"`{name}` must not be 0, for H would not depend on t: define it with from_sympy, without time."
-        )
+        raise ValueError(f"`{name}` must not be 0, for H would not depend on t: define it by from_sympy, without time.")
     return value
 
 

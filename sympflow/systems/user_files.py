@@ -83,7 +83,11 @@ def factory(path: str | os.PathLike[str], name: str | None = None) -> Callable[.
     file = Path(path)
     if file.suffix == ".toml":
         return _of_toml(file, name)
-    module = _module(file)
+    _text(file)
+    try:
+        module = _run(file.resolve())
+    except (Exception, SystemExit) as error:
+        raise ValueError(f"`system` {str(file)!r} cannot be run ({_described(error, file)}): mend it.") from error
     if name is None:
         names = _candidates(module)
         if len(names) == 1:
@@ -227,21 +231,11 @@ def _text(file: Path) -> str:
         raise ValueError(f"`system` {str(file)!r} is not a text in UTF-8: save it in UTF-8.") from error
 
 
-def _module(file: Path) -> ModuleType:
-    _text(file)
-    try:
-        return _run(file.resolve())
-    except (Exception, SystemExit) as error:
-        raise ValueError(f"`system` {str(file)!r} cannot be run ({_described(error, file)}): mend it.") from error
-
-
 @cache
 def _run(file: Path) -> ModuleType:
     """The module of a Python file, run once, with its folder on the path as for a script."""
     name = f"sympflow_user_file_{file.stem}"
-    spec = importlib.util.spec_from_file_location(name, file)
-    assert spec is not None
-    assert spec.loader is not None
+    spec: Any = importlib.util.spec_from_file_location(name, file)
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module  # pickles and dataclasses look it up
     if str(file.parent) not in sys.path:

@@ -362,8 +362,7 @@ def _system(
 
 def _states(wave: Callable[..., tuple[np.ndarray, np.ndarray]], x: np.ndarray, t: Any) -> np.ndarray:
     """The states [u, u_t] at times t: (...) to (..., 2n)."""
-    times = np.asarray(t, dtype=float)[..., None]
-    u, u_t = np.broadcast_arrays(*wave(x, times))
+    u, u_t = np.broadcast_arrays(*wave(x, np.asarray(t, dtype=float)[..., None]))
     return np.concatenate([u, u_t], axis=-1)
 
 

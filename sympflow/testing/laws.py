@@ -45,9 +45,7 @@ def start(system: HamiltonianSystem) -> np.ndarray:
     return system.y0
 
 
-def run(
-    integrator: Integrator, system: HamiltonianSystem, t_span: tuple[float, float], y0: Any = None, **arguments: Any
-) -> Solution:
+def run(integrator: Integrator, system: HamiltonianSystem, t_span: Any, y0: Any = None, **arguments: Any) -> Solution:
     """A solution of the integrator's, from the system's y0 unless another is given."""
     y0 = start(system) if y0 is None else y0
     with warnings.catch_warnings():  # the methods of low order are judged by their laws, at any step
@@ -83,9 +81,7 @@ def bare_step(integrator: Integrator, system: HamiltonianSystem) -> str | None:
     return None
 
 
-def _step(
-    integrator: Integrator, system: HamiltonianSystem, t: float = 0.0
-) -> Callable[[np.ndarray, np.ndarray | float], np.ndarray]:
+def _step(integrator: Integrator, system: HamiltonianSystem, t: float = 0.0) -> Callable[[np.ndarray, Any], np.ndarray]:
     reason = bare_step(integrator, system)
     if reason is not None:
         raise NotApplicable(reason)
@@ -105,9 +101,7 @@ def a_step_length_for_each_state(integrator: Integrator, system: HamiltonianSyst
     together = step(y, h)
     assert together.shape == y.shape, f"a step of states {y.shape} has shape {together.shape}"
     for i in range(3):
-        assert_close(
-            together[i], step(y[i], h[i]), 1e3 * EPS, f"state {i} of a batch with its own h differs from alone"
-        )
+        assert_close(together[i], step(y[i], h[i]), 1e3 * EPS, f"state {i} of a batch with its own h differs alone")
         assert_close(together[i], step(y[i], float(h[i])), 1e3 * EPS, "h as a number or an array differs")
 
 
@@ -140,17 +134,15 @@ def the_order_is_the_slope(integrator: Integrator, system: HamiltonianSystem) ->
     assert -0.6 < excess < (0.6 if settled else 1.5), f"declared {integrator.order}, measured {slopes[-1]:.2f}"
 
 
-def _slopes_of_steps(
-    integrator: Integrator, system: HamiltonianSystem, t: float = 0.0, to_an_octave: int = 1
-) -> list[float]:
+def _slopes_of_steps(integrator: Integrator, system: HamiltonianSystem, t: float = 0.0, finer: int = 1) -> list[float]:
     """Slopes between steps h and h/2, so many h to an octave, the last at the shortest whose error is no rounding."""
     y, step = states(system, 12), _step(integrator, system, t)
     errors: list[float] = []
-    for h in (1.6 / 2 ** (k / to_an_octave) for k in range(12 * to_an_octave)):
+    for h in (1.6 / 2 ** (k / finer) for k in range(12 * finer)):
         errors.append(float(np.median(np.abs(step(y, np.full(len(y), h)) - exact(system, h, len(y), t)).max(-1))))
         if errors[-1] < 1e-13:  # as exact as the reference
             break
-    return [float(np.log2(a / b)) - 1 for a, b in zip(errors, errors[to_an_octave:], strict=False) if b > 1e-12]
+    return [float(np.log2(a / b)) - 1 for a, b in zip(errors, errors[finer:], strict=False) if b > 1e-12]
 
 
 def _slopes_of_runs(integrator: Integrator, system: HamiltonianSystem) -> list[float]:
@@ -200,10 +192,8 @@ def symplecticity_as_declared(integrator: Integrator, system: HamiltonianSystem)
         assert defect > low, f"AᵀJA = J to {defect:.1e}: declare `symplectic = True`"
 
 
-def _jacobian(
-    step: Callable[[np.ndarray, np.ndarray], np.ndarray], y: np.ndarray, h: np.ndarray, reach: float = 0.02
-) -> np.ndarray:
-    """The Jacobians (n, 2d, 2d) of steps from y (n, 2d), by differences of order 8: to about 1e-12."""
+def _jacobian(step: Callable[[np.ndarray, Any], np.ndarray], y: np.ndarray, h: Any, reach: float = 0.02) -> np.ndarray:
+    """The Jacobians (n, ..., 2d) of steps from y (n, 2d), by differences of order 8: to about 1e-12."""
     columns = []
     for i, scale in enumerate(np.abs(y).max(0)):
         e = np.zeros(y.shape[-1])
@@ -224,12 +214,8 @@ def the_inverse_undoes_the_step(integrator: Integrator, system: HamiltonianSyste
 
 
 OF_STEPS: tuple[Callable[[Integrator, HamiltonianSystem], None], ...] = (
-    a_step_length_for_each_state,
-    what_is_not_finite_stays_so,
-    the_order_is_the_slope,
-    the_tangent_is_the_derivative_of_the_step,
-    symplecticity_as_declared,
-    the_inverse_undoes_the_step,
+    *(a_step_length_for_each_state, what_is_not_finite_stays_so, the_order_is_the_slope),
+    *(the_tangent_is_the_derivative_of_the_step, symplecticity_as_declared, the_inverse_undoes_the_step),
 )
 
 
@@ -294,15 +280,10 @@ def dtype_device_and_gradient_of_tensors(integrator: Integrator, system: Hamilto
 def _gradient_by_differences(integrator: Integrator, system: HamiltonianSystem, y0: np.ndarray) -> np.ndarray:
     """The gradient (n, 2d) of the sum of the states at 0.05 and 0.1, from y0 (n, 2d)."""
 
-    def total(y: np.ndarray) -> np.ndarray:
+    def total(y: np.ndarray, h: Any) -> np.ndarray:
         return run(integrator, system, (0.0, 0.1), y, t_eval=[0.05, 0.1]).y.sum((-2, -1))
 
-    columns = []
-    for i in range(y0.shape[-1]):
-        e = np.zeros(y0.shape[-1])
-        e[i] = 0.01
-        columns.append(sum(c * (total(y0 + k * e) - total(y0 - k * e)) for k, c in DIFFERENCES) / e[i])
-    return np.stack(columns, axis=-1)
+    return _jacobian(total, y0, None)
 
 
 def dense_output_equals_the_outputs(integrator: Integrator, system: HamiltonianSystem) -> None:
@@ -339,9 +320,7 @@ def both_directions(integrator: Integrator, system: HamiltonianSystem) -> None:
         raise NotApplicable(f"it has no backward time ({error})") from error
     assert back.t[0] == T_END and back.t[-1] == 0.0, f"t runs from {back.t[0]} to {back.t[-1]}"
     missed, allowed = np.abs(back.y[:, -1] - start(system)).max(), np.abs(there - exact(system)).max()
-    assert missed <= 20 * allowed + 1e-10, (
-        f"backward time misses y0 by {missed:.1e}; the method's error is {allowed:.1e}"
-    )
+    assert missed <= 20 * allowed + 1e-10, f"backward time misses y0 by {missed:.1e}; its own error is {allowed:.1e}"
 
 
 def an_empty_interval(integrator: Integrator, system: HamiltonianSystem) -> None:
@@ -431,17 +410,9 @@ def _the_count_of_a_step(integrator: Integrator, system: HamiltonianSystem) -> N
 
 
 OF_RUNS: tuple[Callable[[Integrator, HamiltonianSystem], None], ...] = (
-    declarations,
-    dtype_and_shape_of_arrays,
-    dtype_device_and_gradient_of_tensors,
-    dense_output_equals_the_outputs,
-    the_end_is_reached,
-    both_directions,
-    an_empty_interval,
-    a_blow_up_is_status_minus_one,
-    a_batch_is_the_loop,
-    events_are_zeros_of_the_dense_output,
-    statistics,
+    *(declarations, dtype_and_shape_of_arrays, dtype_device_and_gradient_of_tensors, dense_output_equals_the_outputs),
+    *(the_end_is_reached, both_directions, an_empty_interval, a_blow_up_is_status_minus_one, a_batch_is_the_loop),
+    *(events_are_zeros_of_the_dense_output, statistics),
 )
 
 
@@ -467,9 +438,7 @@ def the_run_is_its_steps(integrator: Integrator, system: HamiltonianSystem) -> N
     tolerance = 1e4 * EPS if isinstance(integrator, FixedStep) else max(1e4 * EPS, 0.1 * _rtol(integrator))
     assert_close(stepped[:-1], y[1:], tolerance, "step() does not give the next state of the run, but differs")
     if isinstance(integrator, FixedStep):
-        assert_close(
-            stepped[-1], sol.y[:, -1], 1e4 * EPS, "step() does not give the last state of the run, but differs"
-        )
+        assert_close(stepped[-1], sol.y[:, -1], 1e4 * EPS, "step() does not give the run's last state, but differs")
 
 
 def _rtol(integrator: Integrator) -> float:
@@ -501,12 +470,8 @@ def states_within_a_step_belong_to_it(integrator: Integrator, system: Hamiltonia
     if isinstance(integrator, FixedStep) and integrator.on_grid and bare_step(integrator, system) is None:
         with np.errstate(all="ignore"):
             expected = np.asarray(integrator.step(system, 0.0, y, fractions * h))[within]
-        assert_close(
-            inside, expected, 1e4 * EPS, "a state within a step is not the shorter step from its beginning, but away"
-        )
+        assert_close(inside, expected, 1e4 * EPS, "a state within a step is not the shorter step there, but away")
         return
-    from sympflow.solver import solve
-
     reference = solve(system, "dop853", (0.0, T_END), start(system), dense_output=True, rtol=1e-12, atol=1e-14).sol
     assert reference is not None
     error = np.abs(inside - reference(times[within]).T).max()
@@ -528,27 +493,27 @@ def friction_is_in_the_steps(integrator: Integrator, system: HamiltonianSystem) 
     """A method that says `takes_friction` solves a damped system, to its order: nearer to it than to that without."""
     if not integrator.takes_friction:
         raise NotApplicable("it does not say that it takes friction, so damped systems are refused for it")
-    damped, end, effect = _damped()
-    try:
-        integrator.check(damped)
-    except ValueError as reason:
-        raise NotApplicable(f"it does not apply to the default system with friction ({reason})") from None
-    sol = run(integrator, damped, (0.0, T_END), t_eval=[T_END], backend="array")
-    error = float(np.abs(sol.y[..., 0] - end).max())
-    assert error < effect / 4, (
-        f"the end of a damped system is wrong by {error:.1e}, and friction moves it by {effect:.1e}: take −Γp into "
-        "every step, as system.vector_field does, or do not say `takes_friction`"
+    _solves(
+        *(integrator, _damped(), 0.0, "friction", "a damped system", "friction moves it"),
+        "take −Γp into every step, as system.vector_field does, or do not say `takes_friction`",
     )
-    _the_order_is_kept(integrator, damped, "with friction")
 
 
-def _the_order_is_kept(integrator: Integrator, system: HamiltonianSystem, what: str, t: float = 0.0) -> None:
-    """The error of one step from t on falls as fast as declared, of a method that has a bare step and an order."""
+def _solves(integrator: Integrator, case: tuple[HamiltonianSystem, np.ndarray, float], t0: float, *words: str) -> None:
+    """A method solves a system from t0, to its order and nearer to its end than to that without what is in words."""
+    (system, end, effect), (what, named, moves, remedy) = case, words
+    try:
+        integrator.check(system)
+    except ValueError as reason:
+        raise NotApplicable(f"it does not apply to the default system with {what} ({reason})") from None
+    sol = run(integrator, system, (t0, t0 + T_END), t_eval=[t0 + T_END], backend="array")
+    error = float(np.abs(sol.y[..., 0] - end).max())
+    assert error < effect / 4, f"the end of {named} is wrong by {error:.1e}, and {moves} by {effect:.1e}: {remedy}"
     if integrator.order is None or bare_step(integrator, system) is not None:
         return
-    slopes = _slopes_of_steps(integrator, system, t, to_an_octave=2)  # high orders settle just before rounding
+    slopes = _slopes_of_steps(integrator, system, t0, finer=2)  # high orders settle just before rounding
     assert not slopes or slopes[-1] - integrator.order > -0.6, (
-        f"{what} the order is {slopes[-1]:.2f}, and {integrator.order} is declared"
+        f"with {what} the order is {slopes[-1]:.2f}, and {integrator.order} is declared"
     )
 
 
@@ -563,30 +528,19 @@ def _driven() -> tuple[HamiltonianSystem, np.ndarray, float]:
     scene: dict[str, Any] = {"y0": system.y0, "dt": system.dt, "name": "driven"}
     H = f"{system.symbols.H} + q1*cos(2*t)/5"
     driven = HamiltonianSystem.from_sympy(H, time="t", **scene)
-    t0 = DRIVEN_FROM
-    end = solve(driven, "dop853", (t0, t0 + T_END), t_eval=[t0 + T_END], rtol=1e-13, atol=1e-15).y[..., 0]
-    frozen = [HamiltonianSystem.from_sympy(H.replace("2*t", repr(2 * t)), **scene) for t in (0.0, t0)]
-    others = [exact(other) for other in (system, *frozen)]
-    return driven, end, float(min(np.abs(end - other).max() for other in others))
+    end = exact(driven, t0=DRIVEN_FROM)
+    frozen = [HamiltonianSystem.from_sympy(H.replace("2*t", repr(2 * t)), **scene) for t in (0.0, DRIVEN_FROM)]
+    return driven, end, float(min(np.abs(end - exact(other)).max() for other in (system, *frozen)))
 
 
 def the_drive_is_in_the_steps(integrator: Integrator, system: HamiltonianSystem) -> None:
     """A method that says `takes_driving` solves a driven system, to its order: nearer to it than to one held fixed."""
     if not integrator.takes_driving:
         raise NotApplicable("it does not say that it takes H at its times, so driven systems are refused for it")
-    driven, end, effect = _driven()
-    try:
-        integrator.check(driven)
-    except ValueError as reason:
-        raise NotApplicable(f"it does not apply to the default system with a drive ({reason})") from None
-    t1 = DRIVEN_FROM + T_END
-    sol = run(integrator, driven, (DRIVEN_FROM, t1), t_eval=[t1], backend="array")
-    error = float(np.abs(sol.y[..., 0] - end).max())
-    assert error < effect / 4, (
-        f"the end of a driven system is wrong by {error:.1e}, and that the drive moves matters by {effect:.1e}: take H "
-        "at t + c·h in every stage, as system.vector_field(y, t + c * h) does, or do not say `takes_driving`"
+    _solves(
+        *(integrator, _driven(), DRIVEN_FROM, "a drive", "a driven system", "that the drive moves matters"),
+        "take H at t + c·h in every stage, as system.vector_field(y, t + c * h) does, or do not say `takes_driving`",
     )
-    _the_order_is_kept(integrator, driven, "with a drive", DRIVEN_FROM)
 
 
 def the_start_time_does_not_matter(integrator: Integrator, system: HamiltonianSystem) -> None:
@@ -688,12 +642,7 @@ def a_batch_reports_its_failures(integrator: Integrator, system: HamiltonianSyst
 
 
 OF_CONSISTENCY: tuple[Callable[[Integrator, HamiltonianSystem], None], ...] = (
-    the_run_is_its_steps,
-    states_within_a_step_belong_to_it,
-    the_start_time_does_not_matter,
-    friction_is_in_the_steps,
-    the_drive_is_in_the_steps,
-    every_event_is_found,
-    save_every_thins_the_outputs,
+    *(the_run_is_its_steps, states_within_a_step_belong_to_it, the_start_time_does_not_matter),
+    *(friction_is_in_the_steps, the_drive_is_in_the_steps, every_event_is_found, save_every_thins_the_outputs),
     a_batch_reports_its_failures,
 )

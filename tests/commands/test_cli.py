@@ -441,9 +441,8 @@ def test_solve_takes_a_tolerance():
 
 
 def test_solve_takes_a_formula_and_the_values_of_its_symbols():
-    result = run(
-        "solve", "p**2/2 + k*q**4/4", "--k", 3, "--y0", "1,0", "--t-end", 5, "--methods", "srkn11b", "--tol", 1e-9
-    )
+    formula = ("p**2/2 + k*q**4/4", "--k", 3)
+    result = run("solve", *formula, "--y0", "1,0", "--t-end", 5, "--methods", "srkn11b", "--tol", 1e-9)
     assert result.exit_code == 0
     assert float(re.search(r"largest energy error ([0-9.e-]+)", result.output)[1]) <= 1e-9
     stiff = run("solve", "p**2/2 + 1e6*q**2/2 + .5e-3*q", "--y0", "1,0", "--t-end", "0.01")

@@ -254,10 +254,8 @@ class TestAdjoint:
     @pytest.mark.parametrize("kind", ["layers", "primed", "mlp"])
     def test_the_weights_of_a_flow(self, kind):
         """A map without an inverse is run again from its outputs."""
-        psi = {"layers": flow, "primed": lambda: SympFlow.primed(PENDULUM), "mlp": lambda: MLPFlow(1, hidden=(4,))}[
-            kind
-        ]()
-        psi.requires_grad_(True)
+        made = {"layers": flow, "primed": lambda: SympFlow.primed(PENDULUM), "mlp": lambda: MLPFlow(1, hidden=(4,))}
+        psi = made[kind]().requires_grad_(True)
         y0 = times(1.0, 0.2).requires_grad_(True)
         found = [
             torch.autograd.grad(
@@ -480,9 +478,8 @@ class TestRegistration:
     def test_gradients_and_the_adjoint(self):
         y0 = times(1.0, 0.2).requires_grad_(True)
         register("verlet")  # again: it is ours already
-        assert torch.autograd.gradcheck(
-            lambda y: torchdiffeq.odeint(PENDULUM, y, times(0.0, 0.33), method="verlet"), (y0,)
-        )
+        t = times(0.0, 0.33)
+        assert torch.autograd.gradcheck(lambda y: torchdiffeq.odeint(PENDULUM, y, t, method="verlet"), (y0,))
         with pytest.raises(ValueError, match=r"^`method` 'verlet' cannot be used with torchdiffeq's own odeint_adj"):
             torchdiffeq.odeint_adjoint(PENDULUM, y0, times(0.0, 0.33), method="verlet", adjoint_params=())
 

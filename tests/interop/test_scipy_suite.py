@@ -115,10 +115,8 @@ class TestIntegration:
         np.testing.assert_allclose(both.t_events[0], zeros(np.pi / 2), atol=2e-5)
         np.testing.assert_allclose(both.t_events[1], zeros(0.0), atol=2e-5)
         up, down = found(1), found(-1)
-        for i in range(2):
-            np.testing.assert_allclose(
-                sorted([*up.t_events[i], *down.t_events[i]]), sorted(both.t_events[i]), atol=1e-9
-            )
+        for a, b, whole in zip(up.t_events, down.t_events, both.t_events, strict=True):
+            np.testing.assert_allclose(sorted([*a, *b]), sorted(whole), atol=1e-9)
         end.terminal = True
         ended = found(0, end)
         assert (ended.status, ended.message) == (1, "A termination event occurred.")

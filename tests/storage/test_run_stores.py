@@ -87,9 +87,8 @@ def test_ctrl_c_between_the_steps_and_their_outputs(tmp_path, monkeypatch, case,
     """The steps of a window are made and its outputs not stored, or stored and not yet noted."""
     system, method, options = CASES[case]
     whole = solve(system, method, (0, END), **options)
-    owner, name = {"append": (RunStore, "append"), "pieces": (grid_runs.GridRun, "advance")}.get(
-        where, (grid_runs, where)
-    )
+    methods = {"append": (RunStore, "append"), "pieces": (grid_runs.GridRun, "advance")}
+    owner, name = methods.get(where, (grid_runs, where))
     done, calls = getattr(owner, name), []
 
     def struck(*given):

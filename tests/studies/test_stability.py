@@ -373,11 +373,9 @@ def test_the_command(tmp_path):
 
 
 def test_a_limit_that_is_not_found_is_explained_and_progress_names_every_step():
-    said = []
+    said, methods = [], ["verlet", "impulse", "rk45"]
     family = [systems.harmonic_oscillator(w) for w in (1.0, 2.0)]
-    report = stability(
-        family, ["verlet", "impulse", "rk45"], steps=[0.5, 3.0], metrics=("energy",), progress=said.append
-    )
+    report = stability(family, methods, steps=[0.5, 3.0], metrics=("energy",), progress=said.append)
     notes = report.without_limit()
     assert notes == [
         "No limit of impulse on harmonic oscillator, ω = 1, 2: stable: all up to the length of the interval.",

@@ -94,9 +94,7 @@ def test_the_scene_can_be_described_and_starts_inside_its_domain(scene):
     assert system.t_span[1] > system.t_span[0]
 
 
-@pytest.mark.parametrize(
-    "scene", sorted(SCENES.keys() - {"kepler 0.999", "spring pendulum, polar", "henon_heiles_escape"})
-)
+@pytest.mark.parametrize("scene", sorted({*SCENES} - {"kepler 0.999", "spring pendulum, polar", "henon_heiles_escape"}))
 def test_the_default_step_is_sensible(scene):
     """A method of order 8 at the default step keeps the energy to 1e-9 for 200 steps.
 
@@ -202,9 +200,7 @@ def test_on_the_separatrix_of_the_double_well():
 def test_on_the_separatrix_of_the_pendulum():
     t = np.linspace(0, 8, 33)
     sol = solve(systems.pendulum_separatrix(), "dop853", (0, 8), t_eval=t, rtol=1e-13, atol=1e-14)
-    np.testing.assert_allclose(
-        sol.y, [4 * np.arctan(np.exp(t)) - math.pi, 2 / np.cosh(t)], atol=1e-14 * math.exp(8) * 10
-    )
+    np.testing.assert_allclose(sol.y, [4 * np.arctan(np.exp(t)) - np.pi, 2 / np.cosh(t)], atol=1e-13 * math.exp(8))
     below, above = (solve(systems.pendulum_separatrix(E), "kahan_li8", (0, 50)).y[0] for E in (1.99, 2.01))
     assert abs(below).max() < math.pi
     assert above[-1] > 4 * math.pi
@@ -276,9 +272,8 @@ def test_the_pythagorean_bodies_meet_as_they_should():
     """The closest approach, at t = 15.8299."""
     sol = solve(systems.three_body(), "dop853", (0, 16), rtol=1e-13, atol=1e-14)
     bodies = sol.states[:, :6].reshape(-1, 3, 2)
-    distance = np.min(
-        [np.linalg.norm(bodies[:, i] - bodies[:, j], axis=1) for i, j in ((0, 1), (0, 2), (1, 2))], axis=0
-    )
+    distances = [np.linalg.norm(bodies[:, i] - bodies[:, j], axis=1) for i, j in ((0, 1), (0, 2), (1, 2))]
+    distance = np.min(distances, axis=0)
     assert distance.min() == pytest.approx(4.14e-4, rel=0.01)
     assert sol.t[distance.argmin()] == pytest.approx(15.8299, abs=2e-4)
 

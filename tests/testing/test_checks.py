@@ -304,9 +304,7 @@ def saves_every_step(self, problem):
 def friction_far_out(self, system, t, y, h):
     y_next = SoundVerlet.step(self, system, t, y, h)
     far = (y * y).sum(-1) > 0.5
-    return (
-        y_next * (1 - 1e-3 * (far.to(y.dtype) if isinstance(y, torch.Tensor) else np.asarray(far, y.dtype)))[..., None]
-    )
+    return y_next * (1 - 1e-3 * (far.to(y.dtype) if torch.is_tensor(y) else np.asarray(far, y.dtype)))[..., None]
 
 
 @pytest.mark.parametrize(
