@@ -186,6 +186,11 @@ ANSWERED = {
     "from_sympy(tspan=)": (lambda: H(SPRING, tspan=1), TypeError, "did you mean `t_span`"),
     "any case": (lambda: systems.Kepler, AttributeError, "Did you mean 'kepler'"),
     "system.train": (lambda: H(SPRING).train, AttributeError, r"take sympflow.train\(system\)"),
+    "y0 of a formula": (
+        lambda: solve(SPRING, y0=[1, 0, 0]),
+        ValueError,
+        r"for 'H = p1\*\*2/2 \+ q1\*\*2/2', \[q, p\] with 1 each",
+    ),
     "f.pt": (lambda: sympflow.shipped_flows("pendulum")[0].load().save("f.pt"), ValueError, "call it f.safetensors"),
     "a list of elements": (
         lambda: HamiltonianSystem.planets([1, 0.1], elements=[{"a": 1}]),

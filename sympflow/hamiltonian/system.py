@@ -21,7 +21,7 @@ from sympflow.arrays import Array, one_lane
 from sympflow.hamiltonian.domain import Domain, domain_of
 from sympflow.hamiltonian.fingerprint import fingerprint
 from sympflow.hamiltonian.friction import Friction
-from sympflow.hamiltonian.hamiltonian import Hamiltonian
+from sympflow.hamiltonian.hamiltonian import UNNAMED, Hamiltonian
 from sympflow.hamiltonian.linear_part import checked_damping, checked_inverse_mass, checked_stiffness, numeric
 from sympflow.hamiltonian.times import check_period, probe_times
 from sympflow.show.cards import Answering, Card, cut, numbers
@@ -48,7 +48,6 @@ SHOWN_NAMES = (
 """The attributes that `dir` lists: those that users need. All others are for methods and studies."""
 MOST_WRITTEN_OUT = 400
 """Coordinates of an expression before a warning: 512 of a chain take 2 s to define, and a step 14 times as long."""
-UNNAMED = "custom"
 MEANT = {
     **dict.fromkeys(("dim", "dimension", "dimensions"), "degrees of freedom of a function are `ndof`, of pairs `dim`."),
     "mass": "masses are in T(p), or `masses` of pairs.",
@@ -582,13 +581,13 @@ class HamiltonianSystem(Hamiltonian, Answering):
         """
         if self.local is None:
             raise TypeError(
-                f"`system` {self.name!r} is not a lattice, and only lattices have subsystems of a few sites: define it "
+                f"`system` {self.called} is not a lattice, and only lattices have subsystems of a few sites: define it "
                 "by HamiltonianSystem.lattice."
             )
         local = self.local.subsystem(sites, boundary)
         if self.damping is not None and self.damping.ndim:
             raise ValueError(
-                f"`damping` of {self.name!r} differs from site to site, and a subsystem needs sites that are alike: "
+                f"`damping` of {self.called} differs from site to site, and a subsystem needs sites that are alike: "
                 "give one rate."
             )
         domain = None
@@ -786,12 +785,12 @@ class HamiltonianSystem(Hamiltonian, Answering):
             return
         if self.symbols is None:
             raise TypeError(
-                f"`params` are of symbolic systems, and {self.name!r} is given by functions, which hold their values: "
+                f"`params` are of symbolic systems, and {self.called} is given by functions, which hold their values: "
                 "make a system for each, or define it with HamiltonianSystem.from_sympy(..., params=...)."
             )
         if self.external_force is not None:
             raise ValueError(
-                f"`params` of {self.name!r} are those of H and not of its external force: make a system for each value."
+                f"`params` of {self.called} are those of H and not of its external force: make a system for each value."
             )
         known = [s.name for s in self.symbols.written[1]]
         for name in names:
@@ -799,7 +798,7 @@ class HamiltonianSystem(Hamiltonian, Answering):
                 has = f"which has {', '.join(known)}" if known else "which has none: write H with symbols for them"
                 if name == "damping" and self.damping is not None:
                     has += "; `damping` is not one: make a system for each value"
-                raise ValueError(f"`params` has {name!r}, no parameter of {self.name!r}, {has}.")
+                raise ValueError(f"`params` has {name!r}, no parameter of {self.called}, {has}.")
 
     @told
     def with_params(self, **values: float) -> HamiltonianSystem:

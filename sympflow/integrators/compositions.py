@@ -151,19 +151,19 @@ class KineticPotential(Composition):
         if not system.separable:
             is_sum = system.written is not None and system.written.separable
             raise ValueError(
-                f"`method` {method!r} needs a separable system, H = T(p) + V(q), and {system.name!r} is "
+                f"`method` {method!r} needs a separable system, H = T(p) + V(q), and {system.called} is "
                 + ("given by one function: define it with V as `potential` and M as `mass`, or " if is_sum else "not: ")
                 + f"use {system.definition.instead}."
             )
         if (scheme.nystrom or scheme.level) and not system.quadratic_kinetic:
             raise ValueError(
-                f"`method` {method!r} needs a kinetic energy ½ pᵀM⁻¹p, which {system.name!r} has not: use a scheme "
+                f"`method` {method!r} needs a kinetic energy ½ pᵀM⁻¹p, which {system.called} has not: use a scheme "
                 "for any separable system, such as 'kahan_li8'."
             )
         if system.friction and not system.quadratic_kinetic:
             raise ValueError(
                 f"`method` {method!r} solves friction exactly where the kinetic energy is ½ pᵀM⁻¹p, which "
-                f"{system.name!r} has not: use a Runge–Kutta method such as 'dop853'."
+                f"{system.called} has not: use a Runge–Kutta method such as 'dop853'."
             )
 
     def check_system(self, dt: float) -> None:
@@ -406,7 +406,7 @@ class LinearRest(ExactMaps):
         if scheme.nystrom and any(part.turns for part in self.parts.rest):
             raise ValueError(
                 f"`method` {method!r} has a Nyström scheme, which needs a rest of H that is a potential U(q), and that "
-                f"of {system.name!r} depends on p too: use 'linear_kahan_li6', 'linear_aba864' or 'impulse'."
+                f"of {system.called} depends on p too: use 'linear_kahan_li6', 'linear_aba864' or 'impulse'."
             )
         if scheme.level > FORCE_GRADIENT:
             raise ValueError(
@@ -578,7 +578,7 @@ class KeplerInteraction(Composition):
         frame = frame_of(system)
         if frame is None:
             raise ValueError(
-                f"`method` {method!r} is for planets about a star, which {system.name!r} is not: make it by "
+                f"`method` {method!r} is for planets about a star, which {system.called} is not: make it by "
                 "HamiltonianSystem.planets, or take the splitting 'kinetic', such as 'srkn11b'."
             )
         frame.check(method)
