@@ -480,7 +480,7 @@ ANSWERED = {
     "an option of a method": (["solve", "kepler", "--rtol", "1e-8"], "behind the name, --method NAME:rtol=1e-8"),
     "a late start": (
         ["solve", "pendulum", "--t-start", "200"],
-        "`--t-start` 200 is not before the end .*: give --t-end",
+        "`--t-start` 200 is not before the end, 100: give --t-end",
     ),
     "methods as words": (["compare", "pendulum", "--methods", "verlet", "rk45"], "--method rk45, several with commas"),
     "a capital": (["solve", "kepler", "--E", "0.3"], "did you mean --e"),
