@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 MOST_IN_SYMBOLS = 300  # operations
 _JUMPING = {"sign", "floor", "mod", "where", "lt", "le", "eq", "atan2"}
+_BENDING = {"abs", "min", "max", "asin", "acos"}
 _SINGULAR = {"div": 1} | dict.fromkeys((
     "pow", "log", "log1p", "tan", "sqrt", "acos", "asin", "acosh", "atanh", "gamma", "lgamma", "digamma", "ellipk",
     "bose", "csch",
@@ -105,7 +106,13 @@ class TracedHamiltonian:
     samples: Mapping[str, Any] = MappingProxyType({})
 
     def __init__(
-        self, ndof: int, program: Program, separable: bool, inverse_mass: np.ndarray | None = None, timed: bool = False
+        self,
+        ndof: int,
+        program: Program,
+        separable: bool,
+        inverse_mass: np.ndarray | None = None,
+        timed: bool = False,
+        kinetic: Program | None = None,
     ) -> None:
         self.ndof, self.program, self.separable = ndof, program, separable
         self.q = tuple(Variable(f"q{i + 1}") for i in range(ndof))
@@ -118,10 +125,12 @@ class TracedHamiltonian:
         if not separable:
             self.H = Formula(program, (*times, *self.q, *self.p))
             return
-        M = np.ones(ndof) if inverse_mass is None else inverse_mass
-        M = np.diag(M) if M.ndim == 1 else M
-        self.inverse_mass = Entries(M)
-        self.T = Formula(traced(lambda *p: [_kinetic(M, p)], *(s.name for s in self.p)), self.p)
+        if kinetic is None:
+            M = np.ones(ndof) if inverse_mass is None else inverse_mass
+            M = np.diag(M) if M.ndim == 1 else M
+            self.inverse_mass = Entries(M)
+            kinetic = traced(lambda *p: [_kinetic(M, p)], *(s.name for s in self.p))
+        self.T = Formula(kinetic, self.p)
         self._set_potential(Formula(program, (*times, *self.q)))
 
     def _set_potential(self, V: Formula) -> None:
@@ -138,13 +147,13 @@ class TracedHamiltonian:
         return self
 
     @property
-    def may_jump(self) -> bool:
-        """True if some operation jumps."""
-        return any(x.name in _JUMPING for x in self.program.operations)
+    def may_bend(self) -> bool:
+        """True if some operation jumps, or has a kink."""
+        return any(x.name in _JUMPING | _BENDING for x in self.program.operations)
 
     def check_continuous(self, argument: str) -> None:
         """Refuse a function that jumps in q or p."""
-        if not self.may_jump or len(self.program) > MOST_IN_SYMBOLS:
+        if not any(x.name in _JUMPING for x in self.program.operations) or len(self.program) > MOST_IN_SYMBOLS:
             return
         from sympflow.hamiltonian.jumps import check_continuous
         from sympflow.hamiltonian.recorded import NotRecorded, in_symbols

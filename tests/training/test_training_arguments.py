@@ -29,7 +29,9 @@ from sympflow.training.table_fit import TableRun
 HH, PENDULUM, OSCILLATOR = systems.henon_heiles(), systems.pendulum(), systems.harmonic_oscillator()
 BOX = sympflow.Box([-1.0, -1.0], [1.0, 1.0])
 RELATIVISTIC = HamiltonianSystem.from_sympy("sqrt(1 + p**2) + q**2/2", name="relativistic", domain=BOX)
-WHOLE = HamiltonianSystem(hamiltonian=lambda q, p: (q * q + p * p).sum(-1) / 2, ndof=1, name="whole", domain=BOX)
+WHOLE = HamiltonianSystem(
+    hamiltonian=lambda q, p: ((q * q + 1) * (p * p + 1)).sum(-1) / 2, ndof=1, name="whole", domain=BOX
+)
 
 
 @pytest.mark.parametrize("maker", [SympFlow.primed, SympFlow.split])
