@@ -83,6 +83,8 @@ class Hamiltonian:
         self.name = name
         self.definition = definition
         self.symbols: Any = definition.symbols
+        self.local: LocalHamiltonian | None = definition if definition.loops else None
+        """The definition by one piece, of a lattice or of pairs, with what it has of its own, such as `shape`."""
         self.ndof: int = definition.ndof
         self.separable: bool = definition.separable
         self._inverse_mass = inverse_mass
@@ -476,11 +478,6 @@ class Hamiltonian:
         if self.followed_mass is None:
             return self._inverse_mass
         return checked_inverse_mass(to_numpy(self.followed_mass), self.ndof)
-
-    @property
-    def local(self) -> LocalHamiltonian | None:
-        """The definition by one piece, of a lattice or of pairs, with what it has of its own, such as `shape`."""
-        return self.definition if self.definition.loops else None
 
     @property
     def form(self) -> SymbolicHamiltonian | TracedHamiltonian | None:

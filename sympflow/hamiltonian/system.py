@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from dataclasses import fields as dataclass_fields
-from functools import cached_property, lru_cache
+from functools import cached_property
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, NoReturn, TypedDict, Unpack
 
@@ -708,6 +708,7 @@ class HamiltonianSystem(Hamiltonian, Answering):
         """Make the system of a definition, in a scene."""
         Hamiltonian.__init__(self, scene.name, definition, inverse_mass, quadratic_kinetic)
         self.stiffness_matrix = stiffness_matrix
+        self._arguments = self.ndof if self.separable else 2 * self.ndof  # components of a state that functions take
         if stiffness_matrix is not None:
             stiffness_matrix.setflags(write=False)
         self.friction = Friction(checked_damping(damping, self.ndof))
@@ -776,6 +777,14 @@ class HamiltonianSystem(Hamiltonian, Answering):
     def step_is_open(self) -> bool:
         """True if `dt` was not given, and the system has no states from which it could be chosen."""
         return self._dt is None and self.y0 is None and self.domain is None
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Take the state of a pickle, of earlier versions too: they kept `params` as such, and tested no functions."""
+        earlier = {"functions_given": False, "_tested": {}, "_params": Parameters(state.get("params", {}))}
+        earlier |= {"_dt": state.get("dt"), "_inverse_mass": state.get("inverse_mass")}
+        earlier["local"] = state["definition"] if state["definition"].loops else None
+        now = {name: value for name, value in state.items() if name not in ("params", "dt", "inverse_mass")}
+        vars(self).update({**earlier, **now})
 
     @property
     def params(self) -> Mapping[str, float]:
@@ -908,11 +917,6 @@ class HamiltonianSystem(Hamiltonian, Answering):
         t0, t1 = self.t_span
         return [t0] if self.autonomous else probe_times(t0, t1 if length is None else t0 + length).tolist()
 
-    @property
-    def _arguments(self) -> int:
-        """The number of components of a state that the given functions depend on: V is one of q alone."""
-        return self.ndof if self.separable else 2 * self.ndof
-
     def kicks(self, t0: float, t1: float) -> list[Kick]:
         """Return the impulses of H between two times, in their order; each has its time `t`, and maps states.
 
@@ -926,8 +930,6 @@ class HamiltonianSystem(Hamiltonian, Answering):
         """
         return self.definition.kicks(t0, t1, self.dt / 4)
 
-    # structure --------------------------------------------------------------------------------------
-
     @cached_property
     def linear_part(self) -> LinearPart:
         """The quadratic part of H: K, its frequencies, the remaining potential U, and the `stiffness`.
@@ -937,8 +939,6 @@ class HamiltonianSystem(Hamiltonian, Answering):
         from sympflow.hamiltonian.linear_part import linear_part
 
         return linear_part(self)
-
-    # identity -------------------------------------------------------------------------------------
 
     @cached_property
     def fingerprint(self) -> tuple[float, ...]:
@@ -1020,41 +1020,38 @@ COUNTED = {
 """The functions of a system that are counted, and as what."""
 
 
-def counting_view(system: HamiltonianSystem, count: Callable[[str, Array], None]) -> HamiltonianSystem:
-    """Return a view of the system that tells `count` of each evaluation of a force or a derivative of it."""
-    view = copy.copy(system)
-    vars(view).pop("between_impulses", None)  # the view itself, where there are none
-    view.__class__ = _counting_class(type(system))
-    view._original, view._count, view._inside = system, count, False  # type: ignore[attr-defined]
-    return view
+class counting_view:
+    """A view of a system that tells `count` of each evaluation of a force or a derivative of it, not of inner ones."""
 
+    def __init__(self, system: HamiltonianSystem, count: Callable[[str, Array], None]) -> None:
+        self._system, self._count = system, count
 
-@lru_cache(maxsize=64)
-def _counting_class(cls: type[HamiltonianSystem]) -> type[HamiltonianSystem]:
-    def counted(name: str) -> Callable[..., Array]:
-        def evaluate(self: Any, x: Array, *more: Array, **named: Array) -> Array:
-            function = getattr(super(view, self), name)
-            if self._inside:  # one of them may call another
-                return function(x, *more, **named)
-            self._inside = True
-            try:
-                value = function(x, *more, **named)
-            finally:
-                self._inside = False
+    @property  # type: ignore[misc]
+    def __class__(self) -> Any:
+        return type(self._system)
+
+    def __getattr__(self, name: str) -> Any:
+        found = getattr(self._system, name)
+        if name not in COUNTED:
+            return self if found is self._system else found  # as between impulses, where there are none
+
+        def evaluate(x: Array, *more: Array, **named: Array) -> Array:
+            value = found(x, *more, **named)
             self._count(COUNTED[name], x)
             return value
 
         return evaluate
 
-    view: Any = type(
-        cls.__name__,
-        (cls,),
-        {
-            **{name: counted(name) for name in COUNTED},
-            "__hash__": lambda self: hash(self._original),
-            "__eq__": lambda self, other: other is self or other is self._original,
-            "__reduce__": lambda self: (copy.copy, (self._original,)),
-            "__doc__": cls.__doc__,
-        },
-    )
-    return view
+    def __call__(self, t: Any, y: Array) -> Array:
+        value = self._system(t, y)
+        self._count(COUNTED["vector_field"], y)
+        return value
+
+    def __hash__(self) -> int:
+        return hash(self._system)
+
+    def __eq__(self, other: object) -> bool:
+        return other is self or other is self._system
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return copy.copy, (self._system,)

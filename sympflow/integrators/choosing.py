@@ -188,9 +188,6 @@ def with_step(integrator: Integrator, system: HamiltonianSystem, y0: np.ndarray)
     return replace(integrator, dt=default_step(system, y0))
 
 
-# the step ------------------------------------------------------------------------------------------------------
-
-
 def choose_step(
     system: GivenSystem,
     method: Any,
