@@ -13,6 +13,7 @@ import numpy as np
 
 from sympflow.arguments import check_flag, told, warn
 from sympflow.arrays import Array, concatenate, is_tensor, to_numpy
+from sympflow.hamiltonian.bodies import PairsHamiltonian
 from sympflow.hamiltonian.scales import known_scale, size_of_terms, weights
 from sympflow.integrators.contract import method_text
 from sympflow.integrators.interpolants import Mapped
@@ -265,7 +266,7 @@ class Solution(Answering):
         ----------
         kinds : sequence of str
             Of "orbit", q₁ against q₂ (q over t of one degree of freedom, a map of all q of many), "phase", q₁ against
-            p₁, and "energy", which is left out where energy is not kept.
+            p₁, of bodies their orbits and x against pₓ/m, and "energy", which is left out where energy is not kept.
         """
         shown = self if self.system.shows_energy is self.system.keeps_energy else self.physical()
         y, kinds = to_numpy(shown.y), (kinds,) if isinstance(kinds, str) else kinds
@@ -273,8 +274,16 @@ class Solution(Answering):
         if self.system.shows_energy:
             with warnings.catch_warnings(action="ignore"):
                 error = energy_change(self).reshape(-1, len(self.t))
+        rates, local, states = None, self.system.local, to_numpy(shown.states)
+        if not self.varied and states.size < LARGE:
+            with np.errstate(all="ignore"):
+                field = shown.system.vector_field(states, np.broadcast_to(self.t, states.shape[:-1]))
+            rates = np.asarray(field).swapaxes(-1, -2).reshape(-1, *y.shape[-2:])
+        masses = local.masses if isinstance(local, PairsHamiltonian) else None
         heading = f"{self.system.title}, {method_text(self.integrator, self.stats.get('dt'))}"
-        return saved(trajectory_figure(self.t, y.reshape(-1, *y.shape[-2:]), error, heading, kinds), path)
+        return saved(
+            trajectory_figure(self.t, y.reshape(-1, *y.shape[-2:]), error, heading, kinds, "", rates, masses), path
+        )
 
     def to_scipy(self) -> OptimizeResult:
         """The `OdeResult` that `scipy.integrate.solve_ivp` would have returned; of a single trajectory.

@@ -186,6 +186,17 @@ ANSWERED = {
     "from_sympy(tspan=)": (lambda: H(SPRING, tspan=1), TypeError, "did you mean `t_span`"),
     "any case": (lambda: systems.Kepler, AttributeError, "Did you mean 'kepler'"),
     "system.train": (lambda: H(SPRING).train, AttributeError, r"take sympflow.train\(system\)"),
+    "y0 of a formula": (
+        lambda: solve(SPRING, y0=[1, 0, 0]),
+        ValueError,
+        r"for 'H = p1\*\*2/2 \+ q1\*\*2/2', \[q, p\] with 1 each",
+    ),
+    "f.pt": (lambda: sympflow.shipped_flows("pendulum")[0].load().save("f.pt"), ValueError, "call it f.safetensors"),
+    "a list of elements": (
+        lambda: HamiltonianSystem.planets([1, 0.1], elements=[{"a": 1}]),
+        ValueError,
+        r"`elements` must give a, .* as in \{'a': \[...\], 'e'",
+    ),
     "scene": (lambda: systems.henon, AttributeError, "Did you mean 'henon_heiles'"),
 }
 
@@ -214,6 +225,22 @@ def test_a_tolerance_chooses_the_step_of_a_run_that_an_event_ends(end):
     turns.terminal, turns.direction = True, 1
     sol = solve("pendulum", "srkn11b", (0, end), [1.0, 0.0], events=turns, tol=1e-12)
     np.testing.assert_allclose(sol.t_events[0], 2 * ellipk(np.sin(0.5) ** 2), rtol=1e-12)
+
+
+def test_a_flow_of_a_system_without_a_domain_is_trained_around_its_orbit():
+    system = H("p**2/2 + q**2/2 + q**4/4", y0=[1.0, 0.0])
+    flow = sympflow.train(system, restarts=1, steps=5, points=40)
+    sol = solve(system, flow, (0, 50))
+    assert "domain_exit" not in sol.stats
+    assert sympflow.max_energy_error(sol) < 1e-4
+
+
+@pytest.mark.parametrize(
+    ("function", "title"),
+    [(sympflow.lyapunov, "Lyapunov exponent"), (sympflow.sali, "SALI"), (sympflow.gali, "GALI")],
+)
+def test_indicators_are_shown_by_their_names(function, title):
+    assert repr(function("henon-heiles", "verlet", (0, 1))).startswith(f"{title}\n")
 
 
 def test_states_in_the_place_of_times_are_told():
