@@ -39,16 +39,6 @@ LARGE = 2_000_000  # numbers of a solution beyond which its card has no energy e
 LOOKED_AT = 64  # outputs at which the terms of H are looked at
 
 
-class NoOutput:
-    """The dense output of a run that was asked for none: it is false."""
-
-    def __bool__(self) -> bool:
-        return False
-
-    def __call__(self, t: Any) -> Array:
-        raise TypeError("`sol` is for runs with dense output: pass dense_output=True to solve(), or times as `t_eval`.")
-
-
 @dataclass(repr=False)
 class Solution(Answering):
     """The solution of an initial value problem, with SciPy's fields.
@@ -59,9 +49,8 @@ class Solution(Answering):
         Output times.
     y : ndarray or tensor of shape (..., 2d, n)
         States [q, p], time last, as in SciPy.
-    sol : callable
-        Dense output: sol(t) has shape (..., 2d) for a number t, (..., 2d, n) for an array. It is false where none was
-        asked for.
+    sol : callable or None
+        Dense output: sol(t) has shape (..., 2d) for a number t, (..., 2d, n) for an array.
     t_events, y_events : list of ndarray or None
         For each event its times (n,) and states (n, 2d), without gradient (`interop.torchdiffeq.odeint_event` gives
         that); None if no events were asked for.
@@ -112,9 +101,6 @@ class Solution(Answering):
     t_events: list[np.ndarray] | None = None
     y_events: list[np.ndarray] | None = None
     rows: ParameterRows | None = None
-
-    def __post_init__(self) -> None:
-        self.sol = self.sol or NoOutput()
 
     def __getitem__(self, key: Any) -> Any:
         raise TypeError(

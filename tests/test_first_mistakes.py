@@ -143,7 +143,6 @@ ANSWERED = {
     "an event of y": (lambda: solve(SPRING, y0=[1, 0], events=lambda y: y), TypeError, r"Write g\(t, y\)"),
     "Tsit5": (lambda: sympflow.get("Tsit5"), ValueError, "'dop853'"),
     "symplectic": (lambda: sympflow.get("symplectic"), ValueError, "'srkn11b', or 'kahan_li8'"),
-    "no dense output": (lambda: ran().sol(3), TypeError, "`sol` is for runs with dense output: pass dense_output=True"),
     "sol[0]": (lambda: ran()[0], TypeError, r"`sol` has no item 0: take `sol.t`, `sol.y`"),
     "t, y = sol": (lambda: list(ran()), TypeError, r"as in t, y = sol.t, sol.y"),
     "sol.q1": (lambda: ran().q1, AttributeError, r"'q1': take `q\[..., i, :\]`"),
@@ -207,8 +206,9 @@ def test_the_answer_names_the_remedy(call, kind, answer):
         call()
 
 
-def test_a_solution_without_dense_output_has_a_false_one():
-    assert not ran().sol
+def test_a_solution_without_dense_output_has_none_as_in_scipy():
+    assert ran().sol is None
+    assert ran().to_scipy()["sol"] is None
     assert solve(SPRING, "verlet", (0, 1), [1, 0], dt=0.1, dense_output=True).sol
 
 
