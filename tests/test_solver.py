@@ -140,9 +140,10 @@ def test_a_batch_of_dopri5_with_one_blow_up_goes_on_one_by_one():
 
 @pytest.mark.parametrize("method", ["verlet", "rk45", "dopri5", "rk4", "sympflow"])
 def test_solutions_can_be_pickled(method):
-    sol = solve(HH, method, (0, 2))
+    sol = solve(HH, method, (0, 2), dense_output=True)
     copy = pickle.loads(pickle.dumps(sol))
     np.testing.assert_array_equal(copy.y, sol.y)
+    np.testing.assert_array_equal(copy.sol(0.7), sol.sol(0.7))
     np.testing.assert_array_equal(copy.energy(), sol.energy())
     assert len(repr(sol)) < 1000
 

@@ -34,7 +34,7 @@ from sympflow.arrays import (
 from sympflow.compiler.program import Program, derivatives, gradient, reached, traced
 from sympflow.compiler.tracing import WEIGHTS, Untraceable, trace, trace_chain
 from sympflow.hamiltonian.definition import Definition
-from sympflow.hamiltonian.formulas import TracedHamiltonian, TracedPoles, without_overflow
+from sympflow.hamiltonian.formulas import MOST_COMPILED, TracedHamiltonian, TracedPoles, without_overflow
 from sympflow.hamiltonian.function_checks import Tested, check_writes, probe_states, test
 from sympflow.hamiltonian.layered import LayeredPotential
 from sympflow.hamiltonian.linear_part import simplest
@@ -141,20 +141,21 @@ class CallableHamiltonian(Definition):
     def layered(self) -> LayeredPotential | None:
         *_, gradient, product = self._functions
         given = self.timed or gradient is not None or product is not None or not self.separable
-        if self.form is not None or self.untraced != WEIGHTS or given:
+        if given or (self.form is not None and self.form.size <= MOST_COMPILED) or self.library != "torch":
             return None
         y0, domain, inverse_mass, _ = self._scene
         try:
             chain = trace_chain(self._given_function, [f"q{i + 1}" for i in range(self.ndof)])
             found = LayeredPotential(self.ndof, chain, inverse_mass)
         except Untraceable as reason:
-            if str(reason) != WEIGHTS:
+            if self.untraced == WEIGHTS != str(reason):
                 self.untraced = f"{WEIGHTS}, and {reason}"
             return None
         states = probe_states(y0, domain, 2 * self.ndof)[:TRIED]
         if not _alike(found.value(states[:, : self.ndof]), self._values(states, [0.0] * len(states))):
             return None
-        self._known = states[0], 0.0, np.nan
+        if self.form is None:
+            self._known = states[0], 0.0, np.nan
         return found
 
     @cached_property
@@ -268,11 +269,11 @@ class CallableHamiltonian(Definition):
         """Raise a ValueError if the function has another value than when it was traced."""
         if self.guard is not None:
             self.guard()
-        if self.layered is not None:
+        if self.form is not None:
+            state, t, expected = self._known
+        elif self.layered is not None:
             state, t, _ = self._known
             expected = float(self.layered.value(state[None, : self.ndof])[0])
-        elif self.form is not None:
-            state, t, expected = self._known
         else:
             return
         with np.errstate(all="ignore"):

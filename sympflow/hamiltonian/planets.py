@@ -114,7 +114,7 @@ class Frame:
             x.append(q[..., i, :] - R)
             R = R + w * x[-1]
             centres.append(R)
-        planets = stack(x, axis=-2)
+        planets = stack(x, axis=-2) if x else q[..., :0, :]
         if len(self.test):
             planets = concatenate([planets, q[..., self.test, :] - stack(centres, axis=-2)[..., self.inside, :]], -2)
         return planets, R
@@ -528,14 +528,16 @@ def _checked_elements(elements: Any, n: int) -> np.ndarray:
             )
         columns: Any = [elements.get(name, 0.0) for name in ELEMENTS]
     else:
-        columns = np.moveaxis(np.asarray(elements, dtype=float), -1, 0) if np.ndim(elements) else ()
+        columns = ()
     try:
+        columns = columns or np.moveaxis(np.asarray(elements, dtype=float), -1, 0)
         table = np.stack([np.broadcast_to(np.asarray(x, dtype=float), (n,)) for x in columns], axis=-1)
-    except ValueError:
+    except (TypeError, ValueError, IndexError):
         table = np.empty((0, 0))
     if table.shape != (n, 6):
         raise ValueError(
-            f"`elements` must give {', '.join(ELEMENTS)} of {n} planets: arrays ({n},), or one of shape ({n}, 6)."
+            f"`elements` must give {', '.join(ELEMENTS)} of {n} planets: arrays ({n},) by these names, as in "
+            f"{{'a': [...], 'e': [...]}}, or one of shape ({n}, 6)."
         )
     a, e, inclination = table[:, :3].T
     for bad, name, remedy in (

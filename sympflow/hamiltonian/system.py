@@ -22,7 +22,7 @@ from sympflow.hamiltonian.definition import bare_copy
 from sympflow.hamiltonian.domain import Domain, domain_of
 from sympflow.hamiltonian.fingerprint import fingerprint
 from sympflow.hamiltonian.friction import Friction
-from sympflow.hamiltonian.hamiltonian import Hamiltonian
+from sympflow.hamiltonian.hamiltonian import UNNAMED, Hamiltonian
 from sympflow.hamiltonian.linear_part import checked_damping, checked_inverse_mass, checked_stiffness, numeric
 from sympflow.hamiltonian.times import check_period, probe_times
 from sympflow.show.cards import Answering, Card, cut, numbers
@@ -49,7 +49,6 @@ SHOWN_NAMES = (
 """The attributes that `dir` lists: those that users need. All others are for methods and studies."""
 MOST_WRITTEN_OUT = 400
 """Coordinates of an expression before a warning: 512 of a chain take 2 s to define, and a step 14 times as long."""
-UNNAMED = "custom"
 MEANT = {
     **dict.fromkeys(("dim", "dimension", "dimensions"), "degrees of freedom of a function are `ndof`, of pairs `dim`."),
     "mass": "masses are in T(p), or `masses` of pairs.",
@@ -535,7 +534,7 @@ class HamiltonianSystem(Hamiltonian, Answering):
             Values of other names in `extra`.
         name, domain, y0, t_span, dt, energy_scale, exact
             As for the class; `t_span` is by default a thousand of the longest periods, `dt` a twentieth of the
-            shortest.
+            shortest; of planets that are bound to each other the step is chosen as for any system.
 
         Raises
         ------
@@ -552,9 +551,12 @@ class HamiltonianSystem(Hamiltonian, Answering):
 
         masses, G, y0 = checked_planets(masses, elements, scene.get("y0"), G, units)
         local = PlanetsHamiltonian(masses, G, y0, coordinates, encounter, extra, params)
-        span, dt = (0.0, 1000 * float(local.frame.periods.max())), local.frame.longest_step
+        span = (0.0, 1000 * float(local.frame.periods.max()))
+        with suppress(ValueError):  # of moons, whose step is left to the choice of the method
+            local.frame.check("kepler")
+            scene["dt"] = scene.get("dt") or local.frame.longest_step
         given = {name: value for name, value in scene.items() if value is not None} | {"y0": y0}
-        return cls._of_local(local, None, Scene.given(given, name="planets", t_span=span, dt=dt))
+        return cls._of_local(local, None, Scene.given(given, name="planets", t_span=span))
 
     def subsystem(
         self, sites: int | Sequence[int] | None = None, boundary: str | Sequence[str] = "periodic"
@@ -589,13 +591,13 @@ class HamiltonianSystem(Hamiltonian, Answering):
         """
         if self.local is None:
             raise TypeError(
-                f"`system` {self.name!r} is not a lattice, and only lattices have subsystems of a few sites: define it "
+                f"`system` {self.called} is not a lattice, and only lattices have subsystems of a few sites: define it "
                 "by HamiltonianSystem.lattice."
             )
         local = self.local.subsystem(sites, boundary)
         if self.damping is not None and self.damping.ndim:
             raise ValueError(
-                f"`damping` of {self.name!r} differs from site to site, and a subsystem needs sites that are alike: "
+                f"`damping` of {self.called} differs from site to site, and a subsystem needs sites that are alike: "
                 "give one rate."
             )
         domain = None
@@ -802,12 +804,12 @@ class HamiltonianSystem(Hamiltonian, Answering):
             return
         if self.symbols is None:
             raise TypeError(
-                f"`params` are of symbolic systems, and {self.name!r} is given by functions, which hold their values: "
+                f"`params` are of symbolic systems, and {self.called} is given by functions, which hold their values: "
                 "make a system for each, or define it with HamiltonianSystem.from_sympy(..., params=...)."
             )
         if self.external_force is not None:
             raise ValueError(
-                f"`params` of {self.name!r} are those of H and not of its external force: make a system for each value."
+                f"`params` of {self.called} are those of H and not of its external force: make a system for each value."
             )
         known = [s.name for s in self.symbols.written[1]]
         for name in names:
@@ -815,7 +817,7 @@ class HamiltonianSystem(Hamiltonian, Answering):
                 has = f"which has {', '.join(known)}" if known else "which has none: write H with symbols for them"
                 if name == "damping" and self.damping is not None:
                     has += "; `damping` is not one: make a system for each value"
-                raise ValueError(f"`params` has {name!r}, no parameter of {self.name!r}, {has}.")
+                raise ValueError(f"`params` has {name!r}, no parameter of {self.called}, {has}.")
 
     @told
     def with_params(self, **values: float) -> HamiltonianSystem:

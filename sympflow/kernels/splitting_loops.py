@@ -92,7 +92,7 @@ class SplittingLoops:
                 self._has_ranges, self.traced = not self._large, True
                 sums = V is not None and not self._large and V.is_polynomial(*symbols.q)
                 self.abreast = LANES_OF_SUMS if sums else LANES
-        elif isinstance(system.form, TracedHamiltonian):
+        elif isinstance(system.form, TracedHamiltonian) and system.layered is None:
             check_size(system.form)
             check_damping(system, False)
             self._has_force_gradient = self.traced = True

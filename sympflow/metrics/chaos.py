@@ -10,7 +10,7 @@ References
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -26,6 +26,7 @@ from sympflow.integrators.impulses import landings
 from sympflow.integrators.registry import naming_plugin
 from sympflow.integrators.steppers import compiled_loops
 from sympflow.metrics.orbits import OfOrbits, Orbits, checked_orbits, of_many
+from sympflow.show.cards import Card
 from sympflow.show.pictures import curves_figure
 from sympflow.systems.given import GivenSystem, given_system
 
@@ -70,12 +71,16 @@ class Indicator(OfOrbits):
     message: str
     t: np.ndarray = field(repr=False)
     history: np.ndarray = field(repr=False)
+    measure: str = field(default="indicator", repr=False)
+
+    def card(self) -> Card:
+        return replace(super().card(), caption=self.measure)
 
     def drawn(self) -> Figure:
         if len(self.t):
             curves = self.history.reshape(-1, len(self.t))
-            return curves_figure(self.t, curves, ("t", "indicator"), self.caption)
-        return of_many("indicator", self.value, "give `t_eval` to see it over time")
+            return curves_figure(self.t, curves, ("t", self.measure), self.message)
+        return of_many(self.measure, self.value, "give `t_eval` to see it over time")
 
 
 def lyapunov(
@@ -471,4 +476,5 @@ def _reported(run: _Run, orbits: Orbits, times: np.ndarray, kind: int, below: fl
 
     t_end = orbits.t_span[0] + run.elapsed[:, -1]
     value, end, status, history = map(shaped, (values[:, -1], t_end, run.status, values[:, :-1]))
-    return Indicator(value, end, status, message, times, np.asarray(history))
+    measure = "Lyapunov exponent" if kind == NONE else "GALI" if kind == VOLUME else "SALI"
+    return Indicator(value, end, status, message, times, np.asarray(history), measure)
