@@ -98,8 +98,7 @@ class Chunk:
 
     def windows(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """The states along the orbits, in bounded memory: times (m,) and states (n, 2d, m), window by window."""
-        times = self.times
-        stepper = self._stepper
+        times, stepper = self.times, self._stepper
         most = max(1, MOST_VALUES // self.y0.size)
         alike = self.t_eval is None and not self.params
         kernel = None if stepper is None else stepper.kernel

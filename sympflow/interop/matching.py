@@ -119,14 +119,12 @@ class Comparison:
         d = rows.shape[-1] // 2
         size = np.repeat([np.abs(rows[:, part]).max() or 1.0 for part in (slice(0, d), slice(d, None))], d)
         noise = np.random.Generator(np.random.PCG64(20260101)).uniform(-1, 1, (len(NEAR), 2 * d))
-        moves = size * noise * np.array(NEAR)[:, None]
-        within = self._within()
+        moves, within = size * noise * np.array(NEAR)[:, None], self._within()
         kinds = len(moves) + len(within)
         probes = []
         for k in range(max(3, -(-kinds // len(rows)))):
             kind = (np.arange(len(rows)) + k * len(rows)) % kinds
-            states = rows + moves[np.minimum(kind, len(moves) - 1)]
-            inside = kind >= len(moves)
+            states, inside = rows + moves[np.minimum(kind, len(moves) - 1)], kind >= len(moves)
             states[inside] = within[kind[inside] - len(moves)]
             probes.append(states.reshape(y0.shape))
         return probes

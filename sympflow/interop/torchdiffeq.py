@@ -313,8 +313,7 @@ def _theirs(run: Any, func: Any, y0: Any, *where: Any, over: Any, endless: bool 
     except ValueError as error:
         if not str(error).startswith("Invalid method"):
             raise
-        name = str(error).split('"')[1]
-        known = sorted({*available(), *_THEIRS})
+        name, known = str(error).split('"')[1], sorted({*available(), *_THEIRS})
         hint = did_you_mean(name.lower(), known)
         raise ValueError(f"`method` {name!r} is unknown.{hint} Choose one of {', '.join(known)}.") from None
 
@@ -377,8 +376,7 @@ def _with_jumps(t: Tensor, length: float | None, jumps: np.ndarray) -> Tensor:
     if length is not None:
         n_steps = math.ceil(float(abs(t[-1] - t[0])) / length)
         grid = torch.cat([t[0] + torch.arange(n_steps).to(t) * torch.sign(t[-1] - t[0]) * length, t[-1:]])
-    at = torch.as_tensor(jumps).to(t)
-    near = 1e-9 * (grid[1:] - grid[:-1]).abs().min()
+    at, near = torch.as_tensor(jumps).to(t), 1e-9 * (grid[1:] - grid[:-1]).abs().min()
     apart = ((grid[1:-1, None] - at).abs() > near).all(-1)
     return torch.cat([grid[:1], torch.cat([grid[1:-1][apart], at]).sort(descending=bool(t[-1] < t[0]))[0], grid[-1:]])
 
@@ -578,8 +576,7 @@ class _Solver:
         self.direction, shapes, announced = 1, None, func
         while type(func).__module__.startswith("torchdiffeq"):
             self.direction = -1 if type(func).__name__ == "_ReverseFunc" else self.direction
-            shapes = getattr(func, "shapes", shapes)
-            func = func.base_func
+            shapes, func = getattr(func, "shapes", shapes), func.base_func
         integrator, system = _build(func, self.method, options)
         self.y0, self.shapes, self.func = y0, shapes, func
         self.integrator, self.system = integrator, system

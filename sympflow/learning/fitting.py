@@ -296,8 +296,7 @@ class Held:
 
 def judged(found: Fitted, held: Trajectories, setting: Setting) -> Held:
     """The likelihood of held-out trajectories."""
-    scales = held.scales
-    pieces = _pieces(held, found.span)
+    scales, pieces = held.scales, _pieces(held, found.span)
     sigma = np.maximum(found.sigma, EXACT * scales)
     problem = Problem(found.model, pieces, found.method, sigma, frozen=True, huber=setting.huber)
     states = _states(found, held, pieces, sigma, setting)

@@ -81,8 +81,7 @@ class Normal:
     def reduced(self) -> tuple[np.ndarray, np.ndarray]:
         """JᵀJ (n, n) and −Jᵀr (n,) of θ when the initial states are eliminated."""
         n = self.C.shape[0]
-        flat = self.B.reshape(-1, n)
-        inverse = np.linalg.pinv(self.A, hermitian=True)
+        flat, inverse = self.B.reshape(-1, n), np.linalg.pinv(self.A, hermitian=True)
         x = (inverse @ self.a[..., None])[..., 0]
         return self.C - flat.T @ (inverse @ self.B).reshape(-1, n), self.c - flat.T @ x.reshape(-1)
 
@@ -174,8 +173,7 @@ class Problem:
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")
     def growth(self, theta: np.ndarray, states: np.ndarray, scales: np.ndarray, limit: float) -> np.ndarray:
         """The times (N,) after which an error of the initial state has grown by a limit; infinite where it has not."""
-        made = np.full(len(states), np.inf)
-        m = len(scales)
+        made, m = np.full(len(states), np.inf), len(scales)
         for batch in self.batches:
             for k, _, X in self._orbits(batch, theta, states, True):
                 assert X is not None

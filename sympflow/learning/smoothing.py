@@ -113,8 +113,7 @@ def _windows(t: np.ndarray, y: np.ndarray, seen: np.ndarray, width: int) -> tupl
     G = np.swapaxes(V * has[..., None], -1, -2) @ V + 1e-10 * np.eye(DEGREE + 1)
     right = np.moveaxis(np.swapaxes(V, 1, 2) @ np.moveaxis(known, 0, -1), -1, 0)
     inverse = np.linalg.inv(G)
-    c = (inverse @ right[..., None])[..., 0]
-    share = np.minimum(inverse[:, :, 0, 0], 1 - 1e-6)
+    c, share = (inverse @ right[..., None])[..., 0], np.minimum(inverse[:, :, 0, 0], 1 - 1e-6)
     left_out = np.where(seen, (c[..., 0] - np.where(seen, y, 0.0)) / (1 - share), 0.0)
     return c[..., 0], c[..., 1] / half, (left_out**2).sum(1)
 

@@ -248,8 +248,7 @@ class Trajectories(Shown):
         """
         d = self.ndof
         q, p = self.scales[:d], self.scales[d:]
-        action = np.exp(np.mean(np.log(q * p)))
-        ratio = np.sqrt(q / p)
+        action, ratio = np.exp(np.mean(np.log(q * p))), np.sqrt(q / p)
         return Scaling(tuple(np.sqrt(action) * ratio), tuple(np.sqrt(action) / ratio), self.time_scale)
 
     def scaled(self, scaling: Scaling) -> Trajectories:

@@ -370,12 +370,10 @@ def _by_arrays(orbits: Orbits, w0: np.ndarray, scale: np.ndarray, times: np.ndar
     t0, t1 = orbits.t_span
     N, n = len(orbits.rows), len(times)
     sign = 1.0 if t1 >= t0 else -1.0
-    W = np.broadcast_to(w0.T, (N, *w0.T.shape)).copy()
-    exponents = np.zeros((N, len(w0)))
+    W, exponents = np.broadcast_to(w0.T, (N, *w0.T.shape)).copy(), np.zeros((N, len(w0)))
     growth, spread = np.full((N, len(w0), n + 1), np.nan), np.full((N, n + 1), np.nan)
     run = _Run(growth, spread, np.zeros((N, n + 1)), np.zeros(N, dtype=int))
-    position = np.zeros(N, dtype=int)
-    running = np.ones(N, dtype=bool)
+    position, running = np.zeros(N, dtype=int), np.ones(N, dtype=bool)
     elapsed = np.zeros(N)
 
     def scaled(vectors: np.ndarray) -> np.ndarray:
@@ -401,8 +399,7 @@ def _by_arrays(orbits: Orbits, w0: np.ndarray, scale: np.ndarray, times: np.ndar
         run.status[running & ~finite] = -1
         running &= finite
         W = np.where(running[:, None, None], moved, W)
-        elapsed = np.where(running, ends, elapsed)
-        lengths = np.linalg.norm(scaled(W), axis=1)
+        elapsed, lengths = np.where(running, ends, elapsed), np.linalg.norm(scaled(W), axis=1)
         powers = np.where(running[:, None] & (lengths > 0), np.frexp(lengths)[1], 0)
         W, exponents = np.ldexp(W, -powers[:, None, :]), exponents + powers
         if below > 0:

@@ -120,8 +120,7 @@ def energy_drift(sol: Solution, blocks: int = MIN_BLOCKS, relative: bool = True)
         raise TypeError(f"`blocks` must be an integer; got {blocks!r}. Use {MIN_BLOCKS} or more.")
     if blocks < MIN_BLOCKS:
         raise ValueError(f"`blocks` must be at least {MIN_BLOCKS} for a meaningful standard error; got {blocks}.")
-    n = len(sol.t)
-    lost = failed(sol)
+    n, lost = len(sol.t), failed(sol)
     if n < blocks and not lost.all():
         raise ValueError(f"`sol` has {n} outputs, fewer than the {blocks} blocks of the fit: ask for more by `t_eval`.")
     batch = sol.y.shape[:-2]

@@ -247,8 +247,7 @@ def _positive_roots(p: Polynomial) -> list[Decimal]:
 
 def _crossing(p: Polynomial, level: Decimal, a: Decimal, b: Decimal) -> Decimal:
     """The x between a and b where p, monotone there, passes a level, to half of the digits."""
-    rising = series.polyval(b, p) > series.polyval(a, p)
-    slope = series.polyder(p)
+    rising, slope = series.polyval(b, p) > series.polyval(a, p), series.polyder(p)
     x = (a + b) / 2
     while b - a > b * Decimal(10) ** (-DIGITS // 2):
         off, steep = series.polyval(x, p) - level, series.polyval(x, slope)
@@ -346,8 +345,7 @@ def _frequencies(system: HamiltonianSystem, y: np.ndarray) -> np.ndarray:
 
 def _quadratic(system: HamiltonianSystem, y0: np.ndarray) -> bool:
     """True if the Hessian of H is the same at states of all sizes."""
-    rng = np.random.default_rng(0)
-    scale = weights(system)
+    rng, scale = np.random.default_rng(0), weights(system)
     size = float(np.abs(scale * y0).max()) or 1.0
     states = np.concatenate([size * s * rng.standard_normal((8, y0.size)) / scale for s in SCALES])
     hessians = np.asarray(system.hessian(states)) / np.outer(scale, scale)
@@ -395,8 +393,7 @@ def _growth(integrator: Integrator, system: HamiltonianSystem, y: np.ndarray, st
 
 def _found(growth: np.ndarray, steps: np.ndarray, at: Callable[[np.ndarray], np.ndarray]) -> list[Window]:
     """The windows in a list of steps, their ends by bisection."""
-    bad = np.concatenate([[False], growth > 1 + GROWS])
-    grid = np.concatenate([[0.0], steps])
+    bad, grid = np.concatenate([[False], growth > 1 + GROWS]), np.concatenate([[0.0], steps])
     edges = np.flatnonzero(bad[1:] != bad[:-1])
     low, high = grid[edges], grid[edges + 1]
     for _ in range(30):

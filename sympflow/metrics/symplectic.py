@@ -52,10 +52,8 @@ def volume_error(sol: Solution, over_time: bool = False) -> np.floating | np.nda
     _check_kept(sol, "volume")
     if sol.varied:
         return gathered(sol, lambda part: volume_error(part, over_time))
-    batch = sol.y.shape[:-2]
-    lost = failed(sol)
-    total = np.zeros(batch)
-    series = np.zeros((len(sol.t), *batch))
+    batch, lost = sol.y.shape[:-2], failed(sol)
+    total, series = np.zeros(batch), np.zeros((len(sol.t), *batch))
     direction = 1 if sol.t_span[1] >= sol.t_span[0] else -1
     first_fold = None
     n_steps = 0
@@ -186,8 +184,7 @@ def symplecticity_estimate(sol: Solution, directions: int = 8, seed: int = 0) ->
     d = system.ndof
     U = torch.from_numpy(np.random.default_rng(seed).standard_normal((directions, 2 * d)))
     i, j = np.triu_indices(directions, 1)
-    worst = np.zeros(sol.y.shape[:-2])
-    error = np.zeros(sol.y.shape[:-2])
+    worst, error = np.zeros(sol.y.shape[:-2]), np.zeros(sol.y.shape[:-2])
     for times, states, lengths in integrator.steps(system, sol.t_span, sol.y0):
         for t, y, h in zip(times, to_numpy(states), lengths, strict=True):
             x, step = torch.tensor(y), torch.as_tensor(h)

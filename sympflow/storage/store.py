@@ -234,8 +234,7 @@ class Store:
 
     def write(self, name: str, index: tuple[int, ...], values: np.ndarray) -> None:
         """Write one chunk, into which `values` must fit; at the edge of the array they may be smaller."""
-        known = self.fields[name]
-        values = np.asarray(values)
+        known, values = self.fields[name], np.asarray(values)
         if values.ndim != len(known.chunks) or (np.array(values.shape) > known.chunks).any():
             raise ValueError(f"`values` of shape {values.shape} are not a chunk of {name!r}, of shape {known.chunks}.")
         if values.shape == known.chunks:
@@ -291,8 +290,7 @@ class Store:
         for name, known in fields.items():
             shape = tuple(lengths.get(dim, n) for dim, n in zip(known.dims, known.shape, strict=True))
             fields[name] = replace(known, shape=shape)
-        changed = self.attributes | dict(attributes or {})
-        before = self.attributes.get(KEPT)
+        changed, before = self.attributes | dict(attributes or {}), self.attributes.get(KEPT)
         with _told(self.path):
             if state is not None:
                 last = STATE.fullmatch(before or "")

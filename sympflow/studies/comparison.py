@@ -434,8 +434,7 @@ class Comparison(Report):
 
 def combined_table(comparisons: Sequence[Comparison], width: int | None = None) -> str:
     """The rows of several comparisons as one table; the methods as columns where `width` does not hold it."""
-    rows = [row for c in comparisons for row in c.rows]
-    several = len(comparisons) > 1
+    rows, several = [row for c in comparisons for row in c.rows], len(comparisons) > 1
     names = [c.title for c in comparisons for _ in c.rows]
     first = [i == 0 for c in comparisons for i in range(len(c.rows))]
     systems = [n if f and several else "" for n, f in zip(names, first, strict=True)]

@@ -275,8 +275,7 @@ def break_even(points: list[Row], length: float, measure: str = "energy_error") 
     filled = []
     for point in points:
         if point in done and point.training_time is not None and untrained:
-            labels = {p.label for p in untrained}
-            error = _figure(point, measure)
+            labels, error = {p.label for p in untrained}, _figure(point, measure)
             rival = min(cost_at([p for p in untrained if p.label == n], error, measure=measure) for n in labels)
             if math.isinf(rival):  # no untrained point is as accurate: nothing to compare with
                 reason = "No break-even: no untrained method was run at a step that reaches this error."

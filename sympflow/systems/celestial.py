@@ -80,8 +80,7 @@ def decaying_orbit(drag: float = 0.002, e: float = 0.3) -> DoubledSystem:
     """
     checked_number("drag", drag, "positive, at most 0.003", lambda x: 0 < x <= 0.003)
     checked_number("e", e, "an eccentricity, 0 ≤ e ≤ 0.6", lambda x: 0 <= x <= 0.6)
-    orbit = kepler(e)
-    p = 1.25 * math.sqrt((1 + e) / (1 - e))
+    orbit, p = kepler(e), 1.25 * math.sqrt((1 + e) / (1 - e))
     high = np.array([1.2 * (1 + e), 1.2 * (1 + e), 0.1, 0.1, 0.1, 0.1, p, p])
     scene: dict[str, Any] = {"y0": orbit.y0, "t_span": (0.0, 10 * math.pi), "dt": 2 * math.pi / 500}
     free = HamiltonianSystem.from_sympy(orbit.symbols.H, name="kepler", **scene)

@@ -559,8 +559,7 @@ def the_start_time_does_not_matter(integrator: Integrator, system: HamiltonianSy
 
 def every_event_is_found(integrator: Integrator, system: HamiltonianSystem) -> None:
     """All zeros in both directions of time, by their direction, up to the count that ends the run; zeros in y too."""
-    phase = (np.arange(-20, 21) * np.pi + SHIFT) / OMEGA
-    ends = [T_END]
+    phase, ends = (np.arange(-20, 21) * np.pi + SHIFT) / OMEGA, [T_END]
     if _goes_backward(integrator, system):
         ends.append(-T_END)
     for t_end in ends:
@@ -569,8 +568,7 @@ def every_event_is_found(integrator: Integrator, system: HamiltonianSystem) -> N
         for direction, expected in ((0, zeros), (1, zeros[rises]), (-1, zeros[~rises])):
             sol = run(integrator, system, (0.0, t_end), events=_wave(direction), event_step=0.1, dense_output=True)
             assert sol.t_events is not None and sol.y_events is not None and sol.sol, "there are no events"
-            found = sol.t_events[0]
-            what = f"of direction {direction} towards t = {t_end}"
+            found, what = sol.t_events[0], f"of direction {direction} towards t = {t_end}"
             assert len(found) == len(expected), f"{len(found)} events {what} are found, there are {len(expected)}"
             assert_close(found, expected, 1e3 * EPS, f"the events {what} are misplaced")
             assert_close(sol.y_events[0], sol.sol(found).T, 1e3 * EPS, "the states of events differ from sol(t)")
