@@ -165,8 +165,7 @@ def best_by_increments(
     data: Trajectories, held: Trajectories, models: Sequence[Model], drives: Sequence[Drive] = (), stop: Stop = never
 ) -> tuple[int, Reading | None, dict[int, float]] | None:
     """The place of the model that explains held-out increments best, a doubt, and the squares by places; or None."""
-    scales, d = data.scales, data.ndof
-    fitted, others = data.sample, held.sample
+    scales, d, fitted, others = data.scales, data.ndof, data.sample, held.sample
     affordable = [k for k, model in enumerate(models) if affords(fitted, model)]
     if not affordable or not others.runs:
         return None
@@ -218,8 +217,7 @@ def _left(model: Field, data: Trajectories, held: Trajectories, scales: np.ndarr
 
 def hint(library: Library, smooth: Smooth, data: Trajectories, force: Any = None, drives: Any = ()) -> str | None:
     """The likeliest reason, none that the model has, why terms do not explain the data, with the remedy; or None."""
-    d, scales = data.ndof, data.scales
-    smooth = smooth.some(MOST_SLOPES)
+    d, scales, smooth = data.ndof, data.scales, smooth.some(MOST_SLOPES)
     x, v = smooth.points, smooth.slopes
     X = library.fields(x)
     if force is not None:

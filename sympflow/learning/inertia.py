@@ -89,8 +89,7 @@ class Inertia(Part):
                 curved = -0.5 * ((C[:, used] @ rows) * products).sum(axis=0) + (u[i] * Wu[j]).sum(axis=0)
                 slopes[i, j] = slopes[j, i] = curved
         if by_parameters:
-            by = np.empty((m, self.n, N))
-            k, pair = self.entries[:, 0], self._pair
+            by, k, pair = np.empty((m, self.n, N)), self.entries[:, 0], self._pair
             g = f[k] - self._shift[:, None]
             pulled = np.stack([W[:, i] * v[j] + (W[:, j] * v[i] if i != j else 0.0) for i, j in self.pairs], axis=1)
             for i in range(d):

@@ -143,8 +143,7 @@ def _of_pair(t: Any, y: Any) -> Iterator[Found]:
 
 
 def _of_ends(x: Any, t: Any, y: Any) -> Iterator[Found]:
-    x, y = _numbers(x, "states"), _numbers(y, "states")
-    t = _numbers(t, "times")
+    x, y, t = _numbers(x, "states"), _numbers(y, "states"), _numbers(t, "times")
     t = t[:, 0] if t.ndim == 2 and t.shape[1] == 1 else t
     if x.shape != y.shape or t.shape not in ((), (1,), (len(x),)):
         raise ValueError(f"`data` is (x, t, y) of shapes {x.shape}, {t.shape}, {y.shape}: give (N, 2d), (N,), (N, 2d).")

@@ -62,8 +62,7 @@ class Normal:
             found = np.linalg.solve(damped, np.concatenate([self.B, self.a[..., None]], axis=2))
         except np.linalg.LinAlgError:
             return None
-        Q, x = found[..., :n], found[..., n]
-        theta = np.zeros(n)
+        Q, x, theta = found[..., :n], found[..., n], np.zeros(n)
         if n:
             flat = self.B.reshape(N * m, n)
             S = self.C - flat.T @ Q.reshape(N * m, n)
@@ -201,8 +200,7 @@ class Problem:
                     return made
                 for i in range(m):
                     J = by[i] * (np.sqrt(weight[i]) / self.sigma[i])
-                    rest = np.sqrt(weight[i]) * r[i]
-                    by_state, by_theta = J[:m], J[m:]
+                    rest, by_state, by_theta = np.sqrt(weight[i]) * r[i], J[:m], J[m:]
                     a += by_state * rest
                     for j in range(m):
                         A[j] += by_state[j] * by_state

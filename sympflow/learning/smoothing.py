@@ -86,8 +86,7 @@ def _curve(run: Run) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np
             if has.any():
                 states[i] = np.interp(run.t, run.t[has], y[has])
         whole = seen.all(0)
-        t, y = run.t[whole], run.y[:, whole]
-        none = np.full(run.y.shape, np.nan)
+        t, y, none = run.t[whole], run.y[:, whole], np.full(run.y.shape, np.nan)
         return states, none, (y[:, 1:] + y[:, :-1]) / 2, np.diff(y) / np.diff(t), (t[1:] + t[:-1]) / 2
     best = np.full(len(run.y), np.inf)
     states, slopes = np.zeros(run.y.shape), np.zeros(run.y.shape)

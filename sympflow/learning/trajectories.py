@@ -145,8 +145,7 @@ class Trajectories(Shown):
             found, names = reading.of_table(data, ndof, order, time, run, q, p, velocity_mass is not None, observed)
             order = "halves"
         elif _is_a("xarray", "Dataset", data):
-            found, names = reading.of_dataset(data), ()
-            order = "halves"
+            found, names, order = reading.of_dataset(data), (), "halves"
         elif isinstance(data, str | Path):
             return cls.read(reading.opened(Path(data)), ndof, **given, **converted)
         elif (

@@ -373,8 +373,7 @@ def _by_arrays(orbits: Orbits, w0: np.ndarray, scale: np.ndarray, times: np.ndar
     W, exponents = np.broadcast_to(w0.T, (N, *w0.T.shape)).copy(), np.zeros((N, len(w0)))
     growth, spread = np.full((N, len(w0), n + 1), np.nan), np.full((N, n + 1), np.nan)
     run = _Run(growth, spread, np.zeros((N, n + 1)), np.zeros(N, dtype=int))
-    position, running = np.zeros(N, dtype=int), np.ones(N, dtype=bool)
-    elapsed = np.zeros(N)
+    position, running, elapsed = np.zeros(N, dtype=int), np.ones(N, dtype=bool), np.zeros(N)
 
     def scaled(vectors: np.ndarray) -> np.ndarray:
         return scale[:, None] * vectors

@@ -119,8 +119,7 @@ def extended_system(system: HamiltonianSystem) -> HamiltonianSystem | None:
 
 def _quadrature(sol: Solution) -> np.ndarray:
     """∫ ∂H/∂t dt along the executed steps, at the outputs."""
-    system, integrator = sol.system, sol.integrator
-    batch = to_numpy(sol.y0).shape[:-1]
+    system, integrator, batch = sol.system, sol.integrator, to_numpy(sol.y0).shape[:-1]
     direction = 1 if sol.t_span[1] >= sol.t_span[0] else -1
     work, total, done = np.zeros((len(sol.t), *batch)), np.zeros(batch), 0
     for times, states, lengths in integrator.steps(system, sol.t_span, sol.y0):

@@ -107,8 +107,7 @@ def a_step_length_for_each_state(integrator: Integrator, system: HamiltonianSyst
 
 def what_is_not_finite_stays_so(integrator: Integrator, system: HamiltonianSystem) -> None:
     """A step from NaN is not finite, so that a blow-up is seen; other states of the batch do not notice."""
-    step = _step(integrator, system)
-    y, h = states(system, 3), np.full(3, 0.05)
+    step, y, h = _step(integrator, system), states(system, 3), np.full(3, 0.05)
     alone = step(y, h)
     for bad in (np.nan, np.inf):
         spoilt = y.copy()
