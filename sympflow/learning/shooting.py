@@ -65,8 +65,7 @@ class Normal:
         Q, x, theta = found[..., :n], found[..., n], np.zeros(n)
         if n:
             flat = self.B.reshape(N * m, n)
-            S = self.C - flat.T @ Q.reshape(N * m, n)
-            D = np.sqrt(np.where(scale > 0, scale, 1.0))
+            S, D = self.C - flat.T @ Q.reshape(N * m, n), np.sqrt(np.where(scale > 0, scale, 1.0))
             try:
                 factor = cho_factor(S / np.outer(D, D) + damping * np.eye(n), check_finite=False)
             except np.linalg.LinAlgError:

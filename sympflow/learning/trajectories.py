@@ -265,8 +265,7 @@ class Trajectories(Shown):
             if none is not None and none[i]:
                 continue
             rows = [run.y[i][np.isfinite(run.y[i])] for run in self.runs]
-            steps = np.concatenate([np.diff(row) for row in rows])
-            spread = float(np.ptp(np.concatenate(rows)))
+            steps, spread = np.concatenate([np.diff(row) for row in rows]), float(np.ptp(np.concatenate(rows)))
             for text, P in ANGLES.items():
                 size = np.abs(steps) / P
                 jumps = size > JUMP

@@ -80,8 +80,7 @@ class LinearStability:
     @property
     def intervals(self) -> tuple[tuple[float, float], ...]:
         """The intervals (from, to) of stability, in order."""
-        starts = [0.0, *(w.stop for w in self.windows)]
-        stops = [*(w.start for w in self.windows), math.inf]
+        starts, stops = [0.0, *(w.stop for w in self.windows)], [*(w.start for w in self.windows), math.inf]
         return tuple((a, b) for a, b in zip(starts, stops, strict=True) if a < b)
 
     def window_of(self, step: float) -> Window | None:

@@ -169,8 +169,7 @@ class Store:
             found = json.loads(_read(place / METADATA, MOST_METADATA))["metadata"]
             names = [key.removesuffix(f"/{ARRAY}") for key in found if key.endswith(f"/{ARRAY}")]
             fields = {name: Field.read(found[f"{name}/{ARRAY}"], found[f"{name}/{ATTRIBUTES}"]) for name in names}
-            attributes = dict(found[ATTRIBUTES])
-            strange = [name for name in names if not is_name(name)]
+            attributes, strange = dict(found[ATTRIBUTES]), [name for name in names if not is_name(name)]
             if strange or not STATE.fullmatch(attributes.get(KEPT, ".state-1.npz")):
                 raise ValueError(f"a path in place of a name, {(strange or [attributes.get(KEPT)])[0]!r}")
             with os.scandir(place) as entries:

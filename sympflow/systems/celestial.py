@@ -128,8 +128,7 @@ def schwarzschild(semilatus: float = 12.0, e: float = 0.5) -> HamiltonianSystem:
     E2 = ((semilatus - 2) ** 2 - 4 * e * e) / (semilatus * (semilatus - 3 - e * e))
     period = 2 * math.pi * (semilatus / (1 - e * e)) ** 1.5
     inner, outer = semilatus / (1 + e), semilatus / (1 - e)
-    widest = 21 * perihelion_angle(semilatus, e)
-    p_r = 2 * (e + 0.1) / math.sqrt(semilatus - 6 - 2 * e)
+    widest, p_r = 21 * perihelion_angle(semilatus, e), 2 * (e + 0.1) / math.sqrt(semilatus - 6 - 2 * e)
     H, near = "((1 - 2/q1)*p1**2 + p2**2/q1**2 - E2/(1 - 2/q1))/2", 0.01 / semilatus
     box = Box([0.98 * inner, -1.0, -p_r, 0.99 * L], [1.02 * outer, widest, p_r, 1.01 * L])
     scene: dict[str, Any] = {"domain": EnergySublevel(-0.5 + near, box, above=-0.5 - near), "dt": period / 500}

@@ -473,8 +473,7 @@ def states_within_a_step_belong_to_it(integrator: Integrator, system: Hamiltonia
         return
     reference = solve(system, "dop853", (0.0, T_END), start(system), dense_output=True, rtol=1e-12, atol=1e-14).sol
     assert reference is not None
-    error = np.abs(inside - reference(times[within]).T).max()
-    allowed = np.abs(sol.y - reference(sol.t)).max()
+    error, allowed = np.abs(inside - reference(times[within]).T).max(), np.abs(sol.y - reference(sol.t)).max()
     assert error <= 20 * allowed + 1e-3 * np.abs(sol.y).max(), f"within steps it is wrong by {error:.1e}"
 
 
@@ -631,8 +630,7 @@ def a_batch_reports_its_failures(integrator: Integrator, system: HamiltonianSyst
     y0, times = np.stack([start(system), bad]), np.array([0.0, 8.0])
     with np.errstate(all="ignore"):
         outcome = integrator.run(Problem(system, 0.0, 8.0, y0, t_eval=times))
-    finite = np.isfinite(np.asarray(outcome.y)).all(axis=(0, 2))
-    status = np.broadcast_to(outcome.status, (2,))
+    finite, status = np.isfinite(np.asarray(outcome.y)).all(axis=(0, 2)), np.broadcast_to(outcome.status, (2,))
     for i, name in ((0, "an ordinary state"), (1, "a state that may blow up")):
         wanted = 0 if finite[i] else -1
         assert status[i] == wanted, f"run() gives {name} of a batch status {status[i]}; its outputs call for {wanted}"
