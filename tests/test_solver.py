@@ -73,6 +73,12 @@ def test_times_are_multiples_not_running_sums():
     assert sol.stats["n_steps"] == 10_000
 
 
+def test_the_last_step_is_shorter():
+    sol = solve(PENDULUM, "verlet", (0, 1), dt=0.3)
+    step = get("verlet")().step
+    np.testing.assert_array_equal(sol.y[:, -1], step(PENDULUM, 0.0, sol.y[:, -2], 1.0 - 3 * 0.3))
+
+
 def test_a_million_steps_store_what_was_asked_for():
     solve(PENDULUM, "verlet", (0, 1), dt=1e-2)
     tracemalloc.start()
@@ -87,7 +93,6 @@ def test_a_million_steps_store_what_was_asked_for():
 # failure ------------------------------------------------------------------------------------------
 
 ESCAPE = {"t_span": (0, 20), "y0": [0, 0, 0, 0.7]}  # the singularity is at t* = 5.450984210235402
-T_STAR = 5.450984210235402
 
 
 @pytest.mark.parametrize("method", METHODS)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
@@ -170,23 +170,23 @@ class SympFlow(FlowMap):
         scale = Scaling.unit(self.ndof, self.dt) if scale is None else scale
         generator = torch.Generator().manual_seed(plain(seed))
         features = 0 if drive is None else drive.size
-
-        def potential(unit: tuple[float, ...], center: tuple[float, ...]) -> MLPPotential:
-            return MLPPotential(
-                self.ndof,
-                hidden,
-                activation,
-                scale=unit,
-                center=center,
-                tau=scale.t,
-                gain=scale.action,
-                features=features,
-                dtype=dtype,
-                device=device,
-                generator=generator,
-            )
-
-        self.layers = _pairs_of_layers(self.ndof, pairs, hidden, scale, potential, features)
+        pairs, widths = plain(pairs), hidden_widths(hidden)
+        if isinstance(pairs, bool) or not isinstance(pairs, int) or pairs < 1:
+            raise ValueError(f"`pairs` must be a positive integer, the number of kick–drift pairs; got {pairs!r}.")
+        if len(scale.q) != ndof:
+            raise ValueError(f"`scale` is for {len(scale.q)} degrees of freedom, not {ndof}: give one entry for each.")
+        if 2 * pairs > MAX_LAYERS:
+            raise ValueError(f"`pairs` must be at most {MAX_LAYERS // 2}, as many as a file may hold; got {pairs!r}.")
+        weights = 2 * pairs * count_weights(self.ndof + features, widths)
+        check_memory(f"`hidden` {widths!r} with `pairs` {pairs}", weights, "take narrower layers, or fewer pairs")
+        like: dict[str, Any] = {"tau": scale.t, "gain": scale.action, "features": features, "generator": generator}
+        like |= {"dtype": dtype, "device": device}
+        units = {Kick: (scale.q, scale.q_center), Drift: (scale.p, scale.p_center)}
+        self.layers = nn.ModuleList(
+            layer(MLPPotential(self.ndof, widths, activation, scale=unit, center=center, **like))
+            for _ in range(pairs)
+            for layer, (unit, center) in units.items()
+        )
 
     @classmethod
     def from_layers(cls, layers: Iterable[Layer], dt: float, drive: Drive | None = None) -> Self:
@@ -697,31 +697,6 @@ class SystemFlow(SympFlow):
     def _compiled_for(self, system: HamiltonianSystem, compensated: bool) -> Kernel:
         """The compiled loops of the flow on a system."""
         raise NotImplementedError
-
-
-def _pairs_of_layers(
-    ndof: int,
-    pairs: Any,
-    hidden: Sequence[int],
-    scale: Scaling,
-    potential: Callable[[tuple[float, ...], tuple[float, ...]], Potential],
-    features: int,
-) -> nn.ModuleList:
-    """Return pairs of a kick and a drift, with potentials made of a unit and a center of q or p; all is checked."""
-    pairs = plain(pairs)
-    if isinstance(pairs, bool) or not isinstance(pairs, int) or pairs < 1:
-        raise ValueError(f"`pairs` must be a positive integer, the number of kick–drift pairs; got {pairs!r}.")
-    if len(scale.q) != ndof:
-        raise ValueError(f"`scale` is for {len(scale.q)} degrees of freedom, not {ndof}: give one entry for each.")
-    if 2 * pairs > MAX_LAYERS:
-        raise ValueError(f"`pairs` must be at most {MAX_LAYERS // 2}, as many as a file may hold; got {pairs!r}.")
-    weights = 2 * pairs * count_weights(ndof + features, widths := hidden_widths(hidden))
-    check_memory(f"`hidden` {widths!r} with `pairs` {pairs}", weights, "take narrower layers, or fewer pairs")
-    return nn.ModuleList(
-        layer
-        for _ in range(pairs)
-        for layer in (Kick(potential(scale.q, scale.q_center)), Drift(potential(scale.p, scale.p_center)))
-    )
 
 
 def _drive_of(told: Any) -> Drive | None:

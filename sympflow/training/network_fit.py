@@ -73,7 +73,15 @@ class LossRun(Run):
         )(0)
         start = states(domain, fit.reference_states, fit.seed, Stream.REFERENCE)
         t0 = start_times(system, flow.dt, len(start), fit.seed, Stream.REFERENCE)
-        end = _end_of_step(system, start, flow.dt, deadline.part(LABEL_SHARE), t0)
+        try:
+            end = reference_step(system, start, flow.dt, check=deadline.part(LABEL_SHARE).check, t0=t0)
+        except OutOfTime:  # then the error of a step is not known
+            end = np.full_like(start, np.nan)
+            warn(
+                f"There was no time to follow {len(start)} held-out states to dt = {flow.dt:g}: the one-step error of "
+                "the flow is not known. Give a longer `time_budget`, a shorter `dt`, or fewer `reference_states`.",
+                RuntimeWarning,
+            )
         exists = np.isfinite(end).all(-1)
         known = (start, end) if t0 is None else (start, end, t0)
         self.reference = tuple(torch.as_tensor(a[exists], dtype=flow.dtype, device=flow.device) for a in known)
@@ -256,21 +264,6 @@ def _first(points: Points, n: int) -> Points:
     m = max(2, x.shape[1] * n // len(points.residual[0]))
     labels = None if points.labels is None else tuple(a[:n] for a in points.labels)
     return Points(tuple(a[:n] for a in points.residual), (t, x[:, :m], *t0), labels)
-
-
-def _end_of_step(
-    system: HamiltonianSystem, x: np.ndarray, dt: float, deadline: Deadline, t0: np.ndarray | None
-) -> np.ndarray:
-    """φ_H,Δt(x), NaN if there is no time for it: then the error of a step is not known."""
-    try:
-        return reference_step(system, x, dt, check=deadline.check, t0=t0)
-    except OutOfTime:
-        warn(
-            f"There was no time to follow {len(x)} held-out states to dt = {dt:g}: the one-step error of the flow is "
-            "not known. Give a longer `time_budget`, a shorter `dt`, or fewer `reference_states`.",
-            RuntimeWarning,
-        )
-        return np.full_like(x, np.nan)
 
 
 def _labels(

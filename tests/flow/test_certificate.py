@@ -25,6 +25,15 @@ def primed(system=HH, **options):
     return SympFlow.primed(system, 3, dt=0.5, **options).requires_grad_(False)
 
 
+@pytest.fixture(scope="module")
+def certified(tmp_path_factory):
+    """A flow with its certificate, and its file."""
+    flow, path = primed(), tmp_path_factory.mktemp("flow") / "flow.safetensors"
+    flow.certificate(HH, **QUICK)
+    flow.save(path)
+    return flow, path
+
+
 FLOWS = {
     "network": (lambda: load(NETWORK), HH),
     "primed": (primed, HH),
@@ -121,8 +130,8 @@ def test_an_upper_limit_of_a_quantile():
     assert upper_limit(np.array([1.0, math.nan])) == math.inf
 
 
-def test_older_certificates_have_no_limit():
-    found = primed().certificate(HH, **QUICK)
+def test_older_certificates_have_no_limit(certified):
+    found = certified[0].certified
     assert found.relative_limit == found.relative_energy_error.largest  # of 20 states
     older = found.to_dict()
     del older["relative_limit"]
@@ -133,8 +142,8 @@ def test_older_certificates_have_no_limit():
 
 def test_the_error_of_the_hamiltonian_against_its_definition():
     flow = shipped(HH)
-    found = flow.certificate(HH, **{**QUICK, "times": 2})
-    x = torch.tensor(HH.domain.sample(300, int(np.random.SeedSequence([0, 20_261, 0]).generate_state(1)[0])))
+    found = flow.certificate(HH, **{**QUICK, "times": 2, "states": 100, "t_end": 10.0})
+    x = torch.tensor(HH.domain.sample(100, int(np.random.SeedSequence([0, 20_261, 0]).generate_state(1)[0])))
     differences = [flow.hamiltonian(t, x) - HH.hamiltonian(x) for t in (0.0, flow.dt)]
     values = torch.cat([(d - d.mean()).abs() for d in differences])
     assert found.hamiltonian_error.largest == pytest.approx(float(values.max()), rel=1e-12)
@@ -149,9 +158,9 @@ def test_an_exact_flow_is_found_exact(rotation):
     assert found.bound(100.0) < 100 * 8 * EPS
 
 
-def test_the_measured_errors_are_those_of_solve():
-    flow = primed()
-    found = flow.certificate(HH, **QUICK)
+def test_the_measured_errors_are_those_of_solve(certified):
+    flow = certified[0]
+    found = flow.certified
     x = HH.domain.sample(20, int(np.random.SeedSequence([0, 20_261, 1]).generate_state(1)[0]))
     together = solve(HH, flow, (0.0, 100.0), y0=x, on_domain_exit="ignore")  # rounds as the measured batch does
     errors = np.abs(together.energy() - together.energy()[:, :1])
@@ -163,8 +172,8 @@ def test_the_measured_errors_are_those_of_solve():
     assert found.relative_energy_error.largest == pytest.approx(relative.max(), rel=1e-9)
 
 
-def test_long_runs_go_piece_by_piece(monkeypatch):
-    whole = primed().certificate(HH, **QUICK)
+def test_long_runs_go_piece_by_piece(certified, monkeypatch):
+    whole = certified[0].certified
     monkeypatch.setattr("sympflow.flow.certification.SAVED_VALUES", 20 * 4 * 7)
     pieces = primed().certificate(HH, **QUICK)
     assert pieces.left == whole.left
@@ -180,28 +189,25 @@ def test_orbits_that_blow_up_are_infinite_errors():
     assert Quantiles.of(np.array([-3.0, 1.0, 2.0])) == Quantiles(2.0, 3.0, 3.0)
 
 
-def test_the_same_seed_gives_the_same_certificate():
-    one, same, other = (primed().certificate(HH, **QUICK, seed=s) for s in (0, 0, 1))
-    assert one == same
-    assert one.delta != other.delta
+def test_the_same_seed_gives_the_same_certificate(certified):
+    same, other = (primed().certificate(HH, **QUICK, seed=s) for s in (0, 1))
+    assert certified[0].certified == same
+    assert same.delta != other.delta
 
 
-def test_single_precision():
+def test_single_precision(certified):
     found = primed(dtype=torch.float32).certificate(HH, **QUICK)
-    assert found.delta.largest == pytest.approx(primed().certificate(HH, **QUICK).delta.largest, rel=1e-3)
+    assert found.delta.largest == pytest.approx(certified[0].certified.delta.largest, rel=1e-3)
 
 
 # files -----------------------------------------------------------------------------------------------------------
 
 
-def test_files_keep_certificates(tmp_path):
-    flow, path = primed(), tmp_path / "flow.safetensors"
-    flow.save(path)
-    assert sympflow.load(path).certified is None
-    found = flow.certificate(HH, **QUICK)
-    assert flow.certified is found
-    flow.save(path)
-    assert sympflow.load(path, system=HH).certified == found
+def test_files_keep_certificates(certified, tmp_path):
+    primed().save(tmp_path / "bare.safetensors")
+    assert sympflow.load(tmp_path / "bare.safetensors").certified is None
+    found = certified[0].certified
+    assert sympflow.load(certified[1], system=HH).certified == found
     assert Certificate.from_dict(json.loads(json.dumps(found.to_dict()))) == found
 
 
@@ -240,10 +246,9 @@ def test_a_flow_in_another_precision_is_saved_without_its_certificate(tmp_path):
         (lambda c: c.update(weights="0"), "certificate is one of other weights"),
     ],
 )
-def test_a_certificate_that_was_tampered_with_is_refused(tmp_path, edit, message):
-    flow, path = primed(), tmp_path / "flow.safetensors"
-    flow.certificate(HH, **QUICK)
-    flow.save(path)
+def test_a_certificate_that_was_tampered_with_is_refused(certified, tmp_path, edit, message):
+    path = tmp_path / "flow.safetensors"
+    path.write_bytes(certified[1].read_bytes())
     tampered(path, lambda record: edit(record["certificate"]))
     with pytest.raises(ValueError, match=rf"^`path` .*{message}"):
         sympflow.load(path)

@@ -19,8 +19,6 @@ from sympflow.flow.scaling import Scaling
 from sympflow.flow.sympflow import SympFlow
 from sympflow.systems import harmonic_oscillator
 
-EPS = torch.finfo(torch.float64).eps
-
 
 def rough(flow, factor=2.0):
     """The flow with larger weights than initialisation gives: far from the identity and from linear."""

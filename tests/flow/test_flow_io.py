@@ -123,10 +123,7 @@ def change(*keys, value):
         (change("architecture", "layers", 0, "kind", value="__import__"), "layer of unknown kind"),
         (change("architecture", "layers", 0, "potential", "type", value="x"), "it needs the potential 'x'"),
         (change("architecture", "layers", 0, "potential", "type", value=3), "potential of unknown type"),
-        (
-            change("architecture", "layers", 0, "potential", "activation", value="relu"),
-            "it needs the activation 'relu'",
-        ),
+        (change("architecture", "layers", 0, "potential", "activation", value="relu"), "the activation 'relu'"),
         (change("architecture", "layers", 0, "potential", "hidden", value=[10**9]), "hidden width"),
         (change("architecture", "layers", 0, "potential", "hidden", value=[4096] * 900), "absurdly large"),
         (change("architecture", "layers", 0, "potential", "hidden", value=[]), "hidden layers"),

@@ -144,11 +144,7 @@ GOOD = SympFlow(1, pairs=1, hidden=(3, 2)).to_potentials()[0]
 @pytest.mark.parametrize(
     ("entry", "error", "message"),
     [
-        (
-            {**GOOD, "weights": [W.T for W in GOOD["weights"]]},
-            ValueError,
-            r"`weights` must have shapes \(h_1, d \+ 1\)",
-        ),
+        ({**GOOD, "weights": [W.T for W in GOOD["weights"]]}, ValueError, r"`weights` must have shapes \(h_1, d"),
         ({**GOOD, "weights": GOOD["weights"][:1]}, ValueError, r"`weights` must be those of one or more hidden layers"),
         ({**GOOD, "biases": GOOD["biases"][:1]}, ValueError, r"`weights` must be those of one or more hidden layers"),
         ({**GOOD, "biases": [b * np.nan for b in GOOD["biases"]]}, ValueError, r"`biases` must be finite"),

@@ -207,12 +207,6 @@ def test_order_of_steps_and_their_jacobians():
     assert sympflow.time_reversal_error(sol) < 1e-8
 
 
-def test_events_find_the_time():
-    sol = solve(DRIVEN, "rk45", (1, 9), events=lambda t, y: y[0], rtol=1e-10, atol=1e-10)
-    peer = solve_ivp(DRIVEN, (1, 9), [1, 0], rtol=1e-10, atol=1e-10, events=lambda t, y: y[0])
-    np.testing.assert_allclose(sol.t_events[0], peer.t_events[0], atol=1e-8)
-
-
 SOL = solve(DRIVEN, "rk45", (0, 3), t_eval=np.linspace(0, 3, 40))
 SUBLEVEL = sympflow.EnergySublevel(1.0, sympflow.Box([-1, -1], [1, 1]))
 AW, SAMPLED = {"a": 1, "w": W}, {"a": SPLINES["cubic"]}

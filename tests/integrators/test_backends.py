@@ -10,7 +10,7 @@ from sympflow.integrators.steppers import compiled_loops
 from sympflow.schemes import SCHEMES
 
 HH = systems.henon_heiles()
-PLAIN = HamiltonianSystem(lambda q: (np.sort(q) ** 4).sum(-1), ndof=1, y0=[1.0, 0.0], gradient=lambda q: 4 * q**3)
+PLAIN = HamiltonianSystem(lambda q: np.median(q, axis=-1) ** 4, ndof=1, y0=[1.0, 0.0], gradient=lambda q: 4 * q**3)
 TRACED = HamiltonianSystem(lambda q: (q**4).sum(-1), ndof=1, y0=[1.0, 0.0])
 AIRY = HamiltonianSystem.from_sympy("p**2/2 - airyai(q)", y0=[1.0, 0.0])
 
@@ -51,7 +51,7 @@ def test_the_compiled_count_merges_the_last_kick_with_the_next_first():
         (HH, {"y0": torch.tensor(HH.y0), "backend": "array"}, "torch"),
         (HH, {"backend": "array"}, "numpy"),
         (TRACED, {}, "compiled"),
-        (PLAIN, {}, "numpy: `potential` could not be traced, for numpy.sort has no rule"),
+        (PLAIN, {}, "numpy: `potential` could not be traced, for numpy.median has no rule"),
         (AIRY, {}, "numpy"),
     ],
 )
@@ -69,7 +69,7 @@ def test_auto_chooses_what_applies(system, arguments, backend):
             {"backend": "compiled", "y0": torch.tensor(HH.y0, requires_grad=True), "method": "tao4"},
             r"^`backend` 'compiled' .* `y0` ",
         ),
-        (PLAIN, {"backend": "compiled"}, r"^`backend` 'compiled' .* functions could not be traced: numpy\.sort"),
+        (PLAIN, {"backend": "compiled"}, r"^`backend` 'compiled' .* functions could not be traced: numpy\.median"),
         (AIRY, {"backend": "compiled"}, r"^`backend` 'compiled' does not apply"),
         (PLAIN, {"compensated": True}, r"^`compensated` sums need compiled loops"),
         (HH, {"backend": "array", "compensated": True}, r"^`compensated` sums need compiled loops"),
@@ -97,12 +97,6 @@ def test_sines_of_far_states_stay_bounded(q):
     sol = solve(systems.pendulum(), "verlet", (0.0, 0.01), y0=[q, 0.0], dt=0.01)
     assert sol.status == 0
     assert abs(sol.p[0, -1]) <= 0.01 * (1 + 1e-15)  # |force| <= 1
-
-
-def test_steps_are_counted_once():
-    sol = solve(HH, "verlet", (0.0, 10.0), dt=0.1, t_eval=[0.05, 10.0])
-    assert sol.stats["n_steps"] == 100
-    assert solve(HH, "verlet", (0.0, 10.03), dt=0.1).stats["n_steps"] == 101
 
 
 BODIES = HamiltonianSystem.pairs("-m1*m2/r", masses=[1.0, 0.5, 0.3], dim=2)

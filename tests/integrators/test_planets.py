@@ -40,8 +40,8 @@ MANY = HamiltonianSystem.planets(
 @pytest.mark.parametrize(
     ("method", "system"),
     [
-        *[(m, s) for m in METHODS for s in (GIANTS, DEMOCRATIC, MANY)],
-        *[(m, s) for m in (BENT, MODIFIED) for s in (GIANTS, EXTRA, MANY)],
+        *[(m, (GIANTS, DEMOCRATIC, MANY)[(i + k) % 3]) for i, m in enumerate(METHODS) for k in (0, 1)],
+        *((BENT, GIANTS), (BENT, EXTRA), (MODIFIED, MANY), (MODIFIED, EXTRA)),
         ("kepler_aba864", EXTRA),
     ],
 )
@@ -190,7 +190,6 @@ def test_compensated_sums_keep_round_off_small():
 @pytest.mark.parametrize(
     ("system", "method", "options"),
     [
-        (GIANTS, "wisdom_holman", {}),
         (GIANTS, "wisdom_holman", {"corrector": 5}),
         (EXTRA, "kepler_aba864", {}),
         (DEMOCRATIC, "wisdom_holman", {}),

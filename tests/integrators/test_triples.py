@@ -57,12 +57,6 @@ def test_a_triple_without_a_name_has_the_order_of_its_scheme(dt):
     assert worst[1] < max(worst[0] / 2**7, 1e-12)
 
 
-def test_the_array_form_of_a_written_triple_is_the_compiled_one():
-    method = get("kahan_li8")(dt=0.1, splitting="linear")
-    arrays, compiled = (solve(FPUT, method, (0, 2), backend=backend) for backend in ("array", "compiled"))
-    np.testing.assert_allclose(arrays.y, compiled.y, rtol=0, atol=1e-11)
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [

@@ -367,7 +367,7 @@ class TestDense:
         torch.testing.assert_close(y(t[2]), expected[2], rtol=0, atol=200 * EPS)
 
     def test_gradients(self):
-        psi = flow().requires_grad_(True)
+        psi = SympFlow(1, hidden=(2,), dt=0.5)
         y0 = times(1.0, 0.2).requires_grad_(True)
 
         def states(y, t, *weights):

@@ -97,15 +97,15 @@ def systems():
 
 
 @pytest.mark.parametrize(
-    ("name", "scheme"),
+    ("name", "scheme", "h"),
     [
-        *((name, s) for name in ("henon_heiles", "numba_chain") for s in [*SCHEMES.values(), EULER, DRIFT, PRIMED]),
-        *((name, KAHAN_LI8) for name in ("pendulum", "relativistic", "kepler")),
-        ("full mass matrix", SCHEMES["omelyan6"]),
+        *(("henon_heiles", s, 0.1) for s in [*SCHEMES.values(), EULER, DRIFT, PRIMED]),
+        *(("numba_chain", s, -0.1) for s in [*SCHEMES.values(), EULER, DRIFT, PRIMED]),
+        *((name, KAHAN_LI8, h) for name in ("pendulum", "relativistic", "kepler") for h in (0.1, -0.1)),
+        ("full mass matrix", SCHEMES["omelyan6"], 0.1),
     ],
     ids=lambda x: getattr(x, "name", x),
 )
-@pytest.mark.parametrize("h", [0.1, -0.1])
 def test_kernel_agrees_with_numpy(systems, name, scheme, h):
     system = systems[name]
     expected = plain_run(system, scheme, h, system.y0, 40)
@@ -312,8 +312,8 @@ def test_an_unstable_step_and_a_division_by_zero_end_a_run(systems):
         (lambda: HamiltonianSystem.from_sympy("p**2*q**2/2 + q**2"), "`system` is not separable"),
         (lambda: HamiltonianSystem.from_sympy("p**2/2 + airyai(q)"), "no compiled function"),
         (
-            lambda: HamiltonianSystem(potential=lambda q: np.sort(q).sum(-1), ndof=1),
-            r"`system` cannot be compiled, .*: numpy\.sort has no rule",
+            lambda: HamiltonianSystem(potential=lambda q: np.median(q, axis=-1), ndof=1),
+            r"`system` cannot be compiled, .*: numpy\.median has no rule",
         ),
     ],
 )

@@ -227,11 +227,10 @@ def in_pairs():
     ("name", "method"),
     [
         *(("chain", m) for m in ("verlet", "chin4a", "linear_srkn6b", "linear_omelyan4", "mollified_impulse", "rk4")),
-        *(("masses", m) for m in ("srkn6b", "chin4a")),
-        *(("two fields", m) for m in ("verlet", "omelyan4", "linear_srkn6b")),
+        ("masses", "srkn6b"),
+        *(("two fields", m) for m in ("omelyan4", "linear_srkn6b")),
         *(("relativistic", m) for m in ("leapfrog", "gauss_legendre4")),
-        *(("damped", m) for m in ("verlet", "chin4a")),
-        *(("pairs", m) for m in ("verlet", "chin4a")),
+        *(("damped", "verlet"), ("pairs", "chin4a")),
     ],
 )
 def test_vectors_of_large_systems_are_moved_by_the_derivative_of_the_step(name, method):

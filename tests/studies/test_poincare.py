@@ -103,11 +103,6 @@ def test_a_batch_is_the_loop():
         np.testing.assert_allclose(together.states[together.trajectory == k], alone.states, atol=1e-11)
 
 
-def test_energy_is_kept_on_the_section():
-    section = poincare_section(HH, "kahan_li8", (0, 300), dt=0.1)
-    np.testing.assert_allclose(HH.hamiltonian(section.states), HH.hamiltonian(HH.y0), rtol=1e-9)
-
-
 def test_rows_table_csv_and_figure(tmp_path):
     section = poincare_section(HH, "verlet", (0, 200), HH.domain.sample(3))
     row = section.rows[0]
@@ -153,12 +148,6 @@ def test_no_crossing():
 def test_bad_arguments_are_named(arguments, error, message):
     with pytest.raises(error, match=message):
         poincare_section(HH, **{"method": "verlet", "t_span": (0, 1), **arguments})
-
-
-def test_interop_modules_load_when_used():
-    assert sympflow.interop.scipy.as_scipy
-    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
-        sympflow.interop.nothing  # noqa: B018
 
 
 # stroboscopic -------------------------------------------------------------------------------------------------------

@@ -96,14 +96,14 @@ def test_the_scene_can_be_described_and_starts_inside_its_domain(scene):
 
 @pytest.mark.parametrize("scene", sorted({*SCENES} - {"kepler 0.999", "spring pendulum, polar", "henon_heiles_escape"}))
 def test_the_default_step_is_sensible(scene):
-    """A method of order 8 at the default step keeps the energy to 1e-9 for 500 steps.
+    """A method of order 8 at the default step keeps the energy to 1e-9 for 200 steps.
 
     Not for a close encounter, which takes a transformation of time, nor for a solution that ends in finite time. Far
     out, where r is 1e9 times p, the coupling of Tao's two copies adds up what differs in units.
     """
     system = SCENES[scene][0]()
     method = "kahan_li8" if system.separable else "gauss_legendre8" if scene.endswith("far out") else "tao8"
-    sol = solve(system, method, (0, 500 * system.dt), backend="array", save_every=50)
+    sol = solve(system, method, (0, 200 * system.dt), backend="array", save_every=20)
     assert max_energy_error(sol) < 1e-9
 
 
@@ -122,14 +122,6 @@ def test_every_scene_is_documented(name):
     assert f"::: sympflow.systems.{SYSTEMS[name].__name__}\n" in (docs / "reference" / "systems.md").read_text(
         encoding="utf-8"
     )
-
-
-def test_parameters_of_a_scene_on_the_command_line():
-    (scene,) = scenes(["spring-pendulum", "--k", "1e4", "--coordinates=polar"])
-    assert not scene.system.separable
-    assert scene.system.params["k"] == 1e4
-    assert scene.key == "spring-pendulum-k=10000-coordinates=polar"
-    assert scenes(["fput:omega=10:m=2"])[0].system.ndof == 4
 
 
 def test_kepler_comes_back_after_every_period():
@@ -261,12 +253,6 @@ def test_the_toda_lattice_keeps_the_eigenvalues_of_laxs_matrix(n):
     if n > 2:
         np.testing.assert_allclose((eigenvalues**2).sum(-1), (system.hamiltonian(system.y0) + n) / 2, rtol=1e-11)
     assert system.domain.contains(sol.states).all()
-
-
-def test_the_toda_lattice_has_no_quadratic_terms():
-    """exp(q₁ − q₂) is no monomial."""
-    with pytest.raises(ValueError, match=r"^`system` 'toda_lattice' has no linear part"):
-        solve(systems.toda_lattice(), "impulse", (0, 1))
 
 
 def test_the_toda_lattice_of_three_is_henon_heiles_to_third_order():

@@ -396,20 +396,17 @@ def test_the_order_with_a_drive_or_friction_is_measured():
         check["friction_is_in_the_steps"](HalfFriction(dt=0.01))
 
 
-def test_a_start_time_that_matters_is_seen_by_its_own_check():
-    with pytest.raises(AssertionError, match=r"^the_start_time_does_not_matter of .*a run from t0 = 5.25 differs"):
-        {check.name: check for check in CHECKS}["the_start_time_does_not_matter"](unsound(step=clock_in_the_step)())
-
-
-def test_states_within_a_step_are_seen_by_their_own_check():
-    check = {check.name: check for check in CHECKS}["states_within_a_step_belong_to_it"]
-    with pytest.raises(AssertionError, match=r"^states_within_a_step_belong_to_it of .*not the shorter step"):
-        check(unsound(stepper=euler_within_steps)())
-
-
-def test_nan_is_seen_by_the_step_alone():
-    with pytest.raises(AssertionError, match=r"^what_is_not_finite_stays_so of .*a step from nan is finite"):
-        {check.name: check for check in CHECKS}["what_is_not_finite_stays_so"](lying(step=hides_nan)())
+@pytest.mark.parametrize(
+    ("name", "liar", "message"),
+    [
+        ("the_start_time_does_not_matter", unsound(step=clock_in_the_step), "a run from t0 = 5.25 differs"),
+        ("states_within_a_step_belong_to_it", unsound(stepper=euler_within_steps), "not the shorter step"),
+        ("what_is_not_finite_stays_so", lying(step=hides_nan), "a step from nan is finite"),
+    ],
+)
+def test_a_lie_that_several_checks_see_is_seen_by_each(name, liar, message):
+    with pytest.raises(AssertionError, match=rf"^{name} of .*{message}"):
+        {check.name: check for check in CHECKS}[name](liar())
 
 
 def test_what_does_not_apply_is_skipped_with_the_reason():

@@ -33,9 +33,6 @@ QUICK = {
 }
 
 
-SHORT = {**QUICK, "restarts": 1, "steps": 10, "points": 30, "reference_states": 10}  # where the result is not judged
-
-
 def weights(flow):
     return torch.cat([w.reshape(-1) for w in flow.state_dict().values()])
 
@@ -390,17 +387,6 @@ def test_the_weight_of_the_energy_counts():
     (state, energy), (other_state, other_energy) = found
     assert other_energy < 0.9 * energy
     assert state < other_state
-
-
-def test_by_default_it_makes_a_primed_flow():
-    flow = train(PENDULUM, 0.5, **QUICK)
-    assert (flow.dt, flow.system) == (0.5, PENDULUM)
-    assert flow.processor
-    assert flow.figures["one_step_error"] < 1e-5
-
-
-def test_training_states_are_not_the_held_out_ones():
-    assert not np.array_equal(states(HH.domain, 3, 0, Stream.RESIDUAL), states(HH.domain, 3, 0, Stream.REFERENCE))
 
 
 # what a fit must not do -----------------------------------------------------------------------------------------

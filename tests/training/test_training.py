@@ -168,11 +168,6 @@ def test_a_system_that_is_not_separable():
     assert torch.linalg.det(A).item() == pytest.approx(1, abs=1e-13)
 
 
-def test_float32():
-    flow = train(harmonic_oscillator(), steps=20, dtype=torch.float32, **QUICK)
-    assert flow.dtype == torch.float32
-
-
 # resumption ----------------------------------------------------------------------------------------------------
 
 

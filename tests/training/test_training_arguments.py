@@ -78,12 +78,7 @@ NEW = {"kind": "sympflow", "pairs": 1, "hidden": (5,)}
         (W, {"optimizer": "gauss-newton", "device": "foo"}, V, "^`device` 'foo' is not to be had here"),
         (W, {"optimizer": "gauss-newton", "dtype": torch.float32}, T, "^`optimizer` .* in float64"),
         (W, {"flow": 3}, T, "^`flow` must be a SympFlow or an MLPFlow; got 3"),
-        (
-            W,
-            {"kind": "mlp", "pairs": 1, "hidden": (2,)},
-            V,
-            "^`hidden` and `pairs` describe .* 16 parameters.*: give wider layers",
-        ),
+        (W, {"kind": "mlp", "pairs": 1, "hidden": (2,)}, V, "^`hidden` and .* 16 parameters.*: give wider layers"),
         (H, SEARCH | {"learning_rate": 1e-2}, T, r"^`learning_rate` is not an option of the optimizer 'gauss-newton'"),
         (H, SEARCH | {"pairs": 3}, T, r"^`pairs` is not an option"),
         (H, SEARCH | {"optimizer": "adam"}, T, r"^`restarts` is not an option of the optimizer 'adam'"),
@@ -130,19 +125,9 @@ NEW = {"kind": "sympflow", "pairs": 1, "hidden": (5,)}
         (P, {"pairs": 10**9}, V, r"^`pairs` must be at most 500, as many as a file may hold"),
         (P, {"stages": 10**6}, V, r"^`stages` must be at most 499"),
         (P, {"processor": 10**6}, V, r"^`processor` must be at most 499"),
-        (
-            P,
-            {"points": 10**12, "stages": 2, "dt": 0.5},
-            V,
-            r"^`points` 1000000000000, .* would take .* GiB.*: take fewer",
-        ),
+        (P, {"points": 10**12, "stages": 2, "dt": 0.5}, V, r"^`points` 10{12}, .* would take .* GiB.*: take fewer"),
         (P, {"points": 10**12, "kind": "sympflow"}, V, r"^`points` 1000000000000 .* would take .* GiB.*: take fewer"),
-        (
-            P,
-            {"points": 10**10, "kind": "sympflow", "optimizer": "gauss-newton"},
-            V,
-            r"^`(points|optimizer)` .* would take .* GiB",
-        ),
+        (P, {"points": 10**10, **NEW, "optimizer": "gauss-newton"}, V, r"^`(points|optimizer)` .* take .* GiB"),
         (P, {"workers": 0}, V, "^`workers` must be a positive number"),
         (P, {"workers": "two"}, T, "^`workers` must be a number, an object with .map"),
         (P, {"workers": 2, "kind": "mlp"}, T, "^`workers` share the starts of a search by 'gauss-newton'"),
@@ -192,11 +177,7 @@ def test_numbers_may_be_numpys(tmp_path):
     ("system", "arguments", "message"),
     [
         (RELATIVISTIC, {"stages": 3}, r"^`stages` asks for .* T = ½ pᵀM⁻¹p.* leave out `stages` .* optimizer='bfgs'"),
-        (
-            RELATIVISTIC,
-            {"kind": "primed", "processor": 2},
-            "^`kind` and `processor` .*leave out `kind` and `processor`",
-        ),
+        (RELATIVISTIC, {"kind": "primed", "processor": 2}, "^(`kind` and `processor`) .*leave out \\1"),
         (WHOLE, {"kind": "primed"}, r"^`kind` asks for .* one function H, .*: leave out `kind` for a network"),
         (WHOLE, {"stages": 3}, "^`stages` asks for .*: leave out `stages` for a network"),
     ],
@@ -237,10 +218,9 @@ QUICK = {"points": 30, "label_times": 2, "reference_states": 5}
         ),
         (
             PENDULUM,
-            NetworkFit(0.5, pairs=1, hidden=(4,), points=30, validation_points=30),
+            NetworkFit(pairs=1, hidden=(4,), points=30, validation_points=30),
             Adam(steps=3, learning_rate=1e-3),
-            {"dt": 0.5, "pairs": 1, "hidden": (4,), "points": 30, "validation_points": 30, "steps": 3}
-            | {"learning_rate": 1e-3},
+            {"pairs": 1, "hidden": (4,), "points": 30, "validation_points": 30, "steps": 3, "learning_rate": 1e-3},
         ),
         (
             PENDULUM,
