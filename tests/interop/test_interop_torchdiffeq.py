@@ -456,8 +456,7 @@ class TestRegistration:
         for method in ("verlet", "sympflow"):
             theirs = torchdiffeq.odeint(HH, y0, times(*t), method=method)
             assert torch.equal(theirs, odeint(HH, y0, times(*t), method=method))
-        pair = (y0[:2], y0[2:])
-        q, p = torchdiffeq.odeint(HH, pair, times(*t), method="verlet")
+        q, p = torchdiffeq.odeint(HH, (y0[:2], y0[2:]), times(*t), method="verlet")
         assert torch.equal(torch.cat([q, p], -1), odeint(HH, y0, times(*t), method="verlet"))
 
     @pytest.mark.parametrize("reverse", [False, True])

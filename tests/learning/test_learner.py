@@ -487,8 +487,7 @@ def test_drives_and_drag_are_learned(forced, tmp_path):
 def test_energies_scatter_along_many_short_trajectories_too():
     """Noise σ of q and p makes the energies of a circle of radius 1 scatter by σ, of 20 points by 4 % less."""
     t, rng = np.linspace(0, 5, 20), np.random.default_rng(0)
-    y = np.stack([np.cos(t), -np.sin(t)]) + 1e-3 * rng.normal(size=(500, 2, 20))
-    data = Trajectories.read((t, y))
+    data = Trajectories.read((t, np.stack([np.cos(t), -np.sin(t)]) + 1e-3 * rng.normal(size=(500, 2, 20))))
     search = Search(data, [data.split(0.9, 0)], _constraints(data, None, None, False, None, None), Setting(), 0)
     flow = sympflow.shipped_flows(sympflow.systems.harmonic_oscillator(), kind="sympflow")[0].load()
     assert search.energy_scatter(flow) == pytest.approx(0.96e-3, rel=0.15)
@@ -634,8 +633,7 @@ def test_networks_grow_no_steps():
     q = np.linspace(-1, 1, 41)
     runs = [(np.linspace(0, 1, 41), np.stack([q, np.sign(q + shift)])) for shift in (0.0, 0.01)]
     data = Trajectories.read(runs)
-    network = Network("q", 3, data.scales[:1])
-    model = Model(1, (known_kinetic(np.eye(1)), network))
+    model = Model(1, (known_kinetic(np.eye(1)), Network("q", 3, data.scales[:1])))
     theta = matched(model, model.start(np.random.default_rng(0)), data, 1 / data.scales, 60)
     a = np.abs(theta[3:])
     assert a.max() < 40

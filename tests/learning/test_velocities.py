@@ -118,8 +118,7 @@ def test_motions_are_found_by_shooting(system, family, place, period, observed):
     data, y = observations(system, observed)
     model = candidate(family, data, place, period)
     found = fitted(model, data, Setting(np.full(2 * system.ndof, 1e-5)))  # as far as they are to be followed
-    v = system.vector_field(y[0].T).T[: system.ndof]
-    seen = np.concatenate([y[0, : system.ndof], v])
+    seen = np.concatenate([y[0, : system.ndof], system.vector_field(y[0].T).T[: system.ndof]])
     right = np.einsum("nij,nj->in", system.field_jacobian(y[0].T), system.vector_field(y[0].T))[: system.ndof]
     assert accelerations(model, found.theta, seen) == pytest.approx(right, abs=1e-3)
 
@@ -162,8 +161,7 @@ def test_learn_gives_h_and_the_momenta():
 )  # fmt: skip
 def test_momenta_are_those_of_velocities(system, v):
     q = 0.3 * np.ones((1, system.ndof))
-    p = system.momenta(q, np.array(v))
-    found = system.vector_field(np.concatenate([q, p], axis=1))[:, : system.ndof]
+    found = system.vector_field(np.concatenate([q, system.momenta(q, np.array(v))], axis=1))[:, : system.ndof]
     assert found == pytest.approx(np.array(v), abs=1e-12)
 
 
@@ -194,6 +192,5 @@ def test_only_the_factor_of_h_is_given():
 
 def test_the_first_velocity_is_the_slope_of_the_positions():
     data, y = observations(PENDULUM, "q")
-    model = Model(1, (known_kinetic(np.eye(1)),), velocities=True)
-    starts = first_states(data, model, np.zeros(0))
+    starts = first_states(data, Model(1, (known_kinetic(np.eye(1)),), velocities=True), np.zeros(0))
     assert starts[:, 1] == pytest.approx(2 * y[:, 1, 0], abs=0.02)  # of a cubic over 0.36

@@ -151,7 +151,6 @@ def test_a_resonance_of_the_impulse_method_is_a_window():
     system = HamiltonianSystem.from_sympy("p**2/2 + 25*q**2/2 - 1 + cos(q)", y0=[0.1, 0.0])
     found = of_method(get("impulse")(), system, _small(system), 1.0)
     h = np.linspace(0.4, 0.9, 100_001)
-    c = np.cos(5 * h) + h / 10 * np.sin(5 * h)
-    outside = h[np.abs(c) > 1]
+    outside = h[np.abs(np.cos(5 * h) + h / 10 * np.sin(5 * h)) > 1]
     assert found.windows[0].start == pytest.approx(outside[0], abs=2e-4)
     assert found.windows[0].stop == pytest.approx(outside[-1], abs=2e-4)

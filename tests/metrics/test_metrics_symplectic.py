@@ -62,8 +62,7 @@ def test_volume_of_one_rk45_step_is_that_of_its_stability_function():
     z = 0.7
     sol = solve(systems.harmonic_oscillator(), "rk45", (0, z), first_step=z, rtol=1e3, atol=1e3)
     assert len(sol.t) == 2
-    coefficients = [1, 1, 1 / 2, 1 / 6, 1 / 24, 1 / 120, 1 / 600]
-    R = sum(c * (1j * z) ** k for k, c in enumerate(coefficients))
+    R = sum(c * (1j * z) ** k for k, c in enumerate([1, 1, 1 / 2, 1 / 6, 1 / 24, 1 / 120, 1 / 600]))
     assert volume_error(sol) == pytest.approx(2 * np.log(abs(R)), rel=1e-10)
 
 

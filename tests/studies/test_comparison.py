@@ -178,8 +178,7 @@ def test_files_hold_every_figure(report, tmp_path):
 
 def test_json_is_strict_where_a_run_blew_up(tmp_path):
     report = compare(systems.harmonic_oscillator(), [get("verlet")(dt=2.1)], ["energy"], t_span=(0, 5000), **QUICK)
-    text = report.to_json(tmp_path / "rows.json").read_text()
-    content = json.loads(text, parse_constant=pytest.fail)
+    content = json.loads(report.to_json(tmp_path / "rows.json").read_text(), parse_constant=pytest.fail)
     assert content["rows"][0]["energy_error"] == "inf"
 
 

@@ -39,8 +39,7 @@ def test_plot_returns_the_figure_and_saves_it_where_a_path_says(report, tmp_path
 
 
 def test_energy_panel_shows_the_running_maximum(report):
-    ax = report.figure("energy").axes[0]
-    bold = [line for line in ax.lines if line.get_linewidth() > 1]
+    bold = [line for line in report.figure("energy").axes[0].lines if line.get_linewidth() > 1]
     assert bold[0].get_ydata()[-1] == report.rows[0].energy_error
     assert (np.diff(bold[0].get_ydata()) >= 0).all()
 
