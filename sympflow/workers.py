@@ -65,9 +65,6 @@ def checked_workers(workers: Any) -> Any:
     return workers
 
 
-# what is sent --------------------------------------------------------------------------------------------------------
-
-
 @cache
 def _versions() -> dict[str, str]:
     found = {"sympflow": __version__, "Python": ".".join(map(str, sys.version_info[:2]))}
@@ -139,9 +136,6 @@ def _unpacked(packed: bytes) -> Any:
             "Install the same versions everywhere."
         )
     return pickle.loads(value)
-
-
-# the calls -----------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

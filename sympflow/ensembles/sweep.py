@@ -263,9 +263,6 @@ def _runs_together(
     return rows.parameter_values is not None and integrator.takes_parameter_values(problem)
 
 
-# chunks --------------------------------------------------------------------------------------------------------------
-
-
 def _chunk_shape(layout: Layout, problem: Chunk, chunk: int | None, in_memory: bool, multiple: int) -> tuple[int, ...]:
     """The shape of a chunk; a ValueError says how large an ensemble is that does not fit."""
     size, total = sum(math.prod(s) for s, _ in layout.fields.values()), math.prod(layout.shape)

@@ -43,8 +43,6 @@ class Comparison:
         self._given: Any = None
         self._next, self._gap = FIRST_LOOK, FIRST_LOOK
 
-    # at the start ---------------------------------------------------------------------------------
-
     def with_system(self, other: HamiltonianSystem) -> None:
         """Raise a ValueError if a system that was passed as the right-hand side is another, by its fingerprint."""
         mine = self.system
@@ -143,8 +141,6 @@ class Comparison:
         """The domain of a flow that was given alone, or a box about it, if its H is not known."""
         domain = self.flow.domain
         return domain.box if isinstance(domain, EnergySublevel) and domain.hamiltonian is None else domain
-
-    # along the run --------------------------------------------------------------------------------
 
     def is_due(self, n_steps: int) -> bool:
         """Return True if the run is to be compared again after so many steps: more and more seldom, never in rhythm."""

@@ -238,9 +238,6 @@ def _span(found: Fitted, data: Trajectories, states: np.ndarray, spread: np.ndar
     return soonest if math.isfinite(soonest) else max(run.span for run in data.runs)
 
 
-# held-out trajectories ------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class Held:
     """How well a model explains trajectories that it was not fitted to; only their initial states are fitted."""

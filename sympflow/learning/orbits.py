@@ -25,10 +25,6 @@ MOST_NUMBERS = 2**20  # of the derivatives of a batch, which then stay in the ca
 SLOPE_POINTS = 10  # of a piece, that give a velocity which was not observed
 SOLVED = 1e-4  # of the error of a scheme, to which its equations are solved
 
-
-# orbits with their derivatives ----------------------------------------------------------------------------------------
-
-
 Orbit = Iterator[tuple[Array, Array | None]]
 """States (2d, N) and derivatives (2d, c, N) at one point after another."""
 Over = Callable[[Array, Array | None, Array, Array], Any]
@@ -197,9 +193,6 @@ class Method:
     def orbit(self, model: Field, theta: Array, x: Array, X: Array | None, gaps: Array, t: Array) -> Orbit:
         """States and derivatives after each of the gaps (k, N) between points; the first gap follows t (N,)."""
         return self.stepper.orbit(partial(self.over, model, theta), x, X, gaps, t)
-
-
-# observations ---------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

@@ -55,8 +55,6 @@ class Run:
         return Run(self.t[start:stop], np.ascontiguousarray(self.y[:, start:stop]))
 
 
-# the kinds of data ----------------------------------------------------------------------------------------------------
-
 Found = tuple[str, np.ndarray, np.ndarray]
 """The name of a trajectory for messages, its times and states, not checked yet."""
 
@@ -387,9 +385,6 @@ def _numbered(columns: list[str], letter: str) -> list[str]:
     found = [(c, re.fullmatch(form, c.lower())) for c in columns]
     numbers = {int("".join(m.groups("")) or 1): c for c, m in found if m}
     return [numbers[i] for i in range(1, len(numbers) + 1)] if sorted(numbers) == [*range(1, len(numbers) + 1)] else []
-
-
-# checks ---------------------------------------------------------------------------------------------------------------
 
 
 def width_of(found: list[Found], ndof: int | None) -> int:

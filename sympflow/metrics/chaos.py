@@ -262,9 +262,6 @@ def checked_threshold(below: float) -> float:
     return value
 
 
-# runs with deviation vectors ----------------------------------------------------------------------
-
-
 @dataclass
 class _Run:
     """Logarithms of lengths (N, k, n + 1), spreads and times (N, n + 1), the last at the end; and the status (N,)."""

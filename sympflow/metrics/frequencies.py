@@ -213,9 +213,6 @@ def signals(signal: Signal, y: np.ndarray, m: int) -> np.ndarray:
     return z.astype(complex)
 
 
-# the analysis ---------------------------------------------------------------------------------------
-
-
 def lines(z: np.ndarray, times: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
     """The frequencies and amplitudes (N, c, n) of the n strongest lines of signals (N, c, m) at equidistant times."""
     found = [_lines_of(row, n) for row in z.reshape(-1, z.shape[-1])]  # by itself: the same in any batch

@@ -184,9 +184,6 @@ def _windows(p: Polynomial, points: list[Decimal], values: list[Decimal]) -> tup
     return tuple(windows)
 
 
-# polynomials ----------------------------------------------------------------------------------------------------------
-
-
 def half_trace(scheme: Scheme) -> tuple[Fraction, ...]:
     """Return the coefficients of the stability polynomial ½ tr in x = z², exactly as the table has them.
 
@@ -256,9 +253,6 @@ def _crossing(p: Polynomial, level: Decimal, a: Decimal, b: Decimal) -> Decimal:
             return newton
         x = newton if a < newton < b and abs(newton - x) < (b - a) / 4 else (a + b) / 2
     return (a + b) / 2
-
-
-# systems --------------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

@@ -222,8 +222,6 @@ class Store:
         """Return the error that says what is wrong with the store."""
         return StoreError(f"`store` {str(self.path)!r} is damaged: {why}. Give another place, or a copy of it.")
 
-    # chunks ---------------------------------------------------------------------------------------
-
     def _file(self, name: str, index: tuple[int, ...]) -> Path:
         return self.path / name / (".".join(map(str, index)) or "0")
 
@@ -275,8 +273,6 @@ class Store:
         if not self.has(name, index):
             raise self.damaged(f"{self._file(name, index).name} of {name!r} is missing")
         return self.read(name, index)
-
-    # commits --------------------------------------------------------------------------------------
 
     def commit(
         self,

@@ -247,8 +247,6 @@ def _errors(
     return truth
 
 
-# methods matched to each other ----------------------------------------------------------------------------------
-
 _CLOSE = math.log(1.05)
 _LONGEST_JUMP = math.log(16.0)
 _ROUNDS = 12
@@ -337,9 +335,6 @@ def matched(
             margin = 0.05 * (above[0] - below[0])
             x = min(max(x, below[0] + margin), above[0] - margin)
     return best[1], best[2]
-
-
-# the report -------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, repr=False)

@@ -165,9 +165,6 @@ def measure_of(system: HamiltonianSystem) -> str:
 _KEPT: dict[str, attempts.Metric] = {"energy_error": attempts.energy, "balance_error": attempts.balance}
 
 
-# the points -----------------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class Conditions:
     """One set of initial states, the interval and the instants, under which every point is run."""
@@ -265,9 +262,6 @@ def _first(candidate: Candidate, conditions: Conditions, compile_time: float | N
 SETTINGS = ("dt", "tolerance")  # settings of a method: the largest that reaches an error is the cheapest
 
 
-# read off the points --------------------------------------------------------------------------------------------------
-
-
 def break_even(points: list[Row], length: float, measure: str = "energy_error") -> list[Row]:
     """Fill in when the training of each flow has paid for itself, for runs over an interval of that length."""
     done = [p for p in points if p.run_time and math.isfinite(_figure(p, measure))]
@@ -304,9 +298,6 @@ def cost_at(points: Sequence[Row], error: float, cost: str = "run_time", measure
             share = math.log(error / e0) / math.log(e1 / e0)
             enough = best(enough, c0 * (c1 / c0) ** share)
     return enough
-
-
-# the report -----------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, repr=False)

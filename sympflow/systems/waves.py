@@ -345,9 +345,6 @@ def _shortest(
     return sign * amplitude * cn, -sign * amplitude * frequency * sn * dn
 
 
-# the parts of a scene ----------------------------------------------------------------------------------------------
-
-
 def _system(
     name: str, wave: Callable[..., Any], x: np.ndarray, high: np.ndarray, t_end: float, low: Any = None, **more: Any
 ) -> HamiltonianSystem:

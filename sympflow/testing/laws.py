@@ -415,9 +415,6 @@ OF_RUNS: tuple[Callable[[Integrator, HamiltonianSystem], None], ...] = (
 )
 
 
-# ruff: noqa: PT018
-
-
 OMEGA, SHIFT = 5.3, 0.9  # of g(t) = sin(OMEGA t − SHIFT), whose zeros are known
 
 
