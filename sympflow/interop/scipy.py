@@ -59,8 +59,7 @@ def as_scipy(method: Any, system: HamiltonianSystem | None = None, **options: An
     >>> solve_ivp(system, (0, 10), system.y0, method=Verlet).y.shape
     (4, 101)
     """
-    integrator = fixed_step(method, options, "SciPy", *([] if system is None else [system]))
-    return _solver_class(integrator, system)
+    return _solver_class(fixed_step(method, options, "SciPy", *([] if system is None else [system])), system)
 
 
 def _solver_class(integrator: FixedStep, system: HamiltonianSystem | None) -> type[FlowSolver]:

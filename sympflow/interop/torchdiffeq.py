@@ -108,8 +108,7 @@ def _integrated(
     compared = _Compared(func, y0, t, integrator, system)
     if event_fn is None:
         announced = _announced(func, y, t, pack, integrator)
-        path = make_path(integrator, system, y, direction, t[0], before_step=announced)
-        return pack(compared.run(path, t))
+        return pack(compared.run(make_path(integrator, system, y, direction, t[0], before_step=announced), t))
     if len(t) != 2:
         raise ValueError(f"`t` must have 2 entries with `event_fn`, the start and a direction; got {len(t)}.")
     found, states = _until_event(make_path(integrator, system, y, direction, t[0]), t[0], event_fn, pack)

@@ -73,8 +73,7 @@ class Indicator(OfOrbits):
 
     def drawn(self) -> Figure:
         if len(self.t):
-            curves = self.history.reshape(-1, len(self.t))
-            return curves_figure(self.t, curves, ("t", "indicator"), self.caption)
+            return curves_figure(self.t, self.history.reshape(-1, len(self.t)), ("t", "indicator"), self.caption)
         return of_many("indicator", self.value, "give `t_eval` to see it over time")
 
 
@@ -358,8 +357,7 @@ def _compiled(
     spread[..., start:-1], spread[..., -1] = found.spread[..., where], found.spread[..., -1]
     elapsed = np.empty((N, len(times) + 1))
     elapsed[:, :-1], elapsed[:, -1] = counts * grid.h, found.n_steps * grid.h
-    status = np.where(found.whole, np.where(found.n_steps < grid.n_steps, 1, 0), -1)
-    return _Run(growth, spread, elapsed, status)
+    return _Run(growth, spread, elapsed, np.where(found.whole, np.where(found.n_steps < grid.n_steps, 1, 0), -1))
 
 
 def _by_arrays(orbits: Orbits, w0: np.ndarray, scale: np.ndarray, times: np.ndarray, kind: int, below: float) -> _Run:

@@ -59,8 +59,7 @@ def max_energy_error(sol: Solution, relative: bool = True) -> np.floating | np.n
     before: a blow-up never looks small.
     """
     error = np.abs(energy_error(sol, relative))
-    worst = np.where(np.isnan(error), np.inf, error).max(axis=-1, initial=0.0)
-    return np.where(failed(sol), np.inf, worst)[()]
+    return np.where(failed(sol), np.inf, np.where(np.isnan(error), np.inf, error).max(axis=-1, initial=0.0))[()]
 
 
 def failed(sol: Solution) -> np.ndarray:
@@ -219,6 +218,5 @@ def energy_growth(sol: Solution, first: float = 1000.0) -> EnergyGrowth:
     scatter = y - y.mean() - exponent * x
     exponent_error = float(np.sqrt(scatter @ scatter / max(1, len(x) - 2) / (x @ x)))
     slopes = error @ n / (n @ n)
-    several = len(slopes) > 1
-    drift_error = float(slopes.std(ddof=1) / np.sqrt(len(slopes))) if several else np.inf
+    drift_error = float(slopes.std(ddof=1) / np.sqrt(len(slopes))) if len(slopes) > 1 else np.inf
     return EnergyGrowth(steps, rms, exponent, exponent_error, float(slopes.mean()), drift_error)

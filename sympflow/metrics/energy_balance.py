@@ -125,8 +125,7 @@ def _quadrature(sol: Solution) -> np.ndarray:
     for times, states, lengths in integrator.steps(system, sol.t_span, sol.y0):
         y = to_numpy(states).astype(float)
         t, h = (np.broadcast_to(x.reshape(-1, *[1] * len(batch)), y.shape[:-1]) for x in (times, lengths))
-        steps = _along(sol, t, y, h)
-        running = total + np.concatenate([np.zeros((1, *batch)), np.cumsum(steps, axis=0)])
+        running = total + np.concatenate([np.zeros((1, *batch)), np.cumsum(_along(sol, t, y, h), axis=0)])
         ends = times + lengths
         due = done + int(np.searchsorted(direction * sol.t[done:], direction * ends[-1], side="right"))
         if due > done:

@@ -98,8 +98,7 @@ def _hold(series: np.ndarray, ends: np.ndarray, values: np.ndarray, t: np.ndarra
         series[index > 0] = values[index[index > 0] - 1]
         return
     for end, value in zip(ends, values, strict=True):
-        passed = (t + tolerance).reshape(-1, *[1] * end.ndim) >= end
-        np.copyto(series, value, where=passed)
+        np.copyto(series, value, where=(t + tolerance).reshape(-1, *[1] * end.ndim) >= end)
 
 
 def symplecticity_defect(
@@ -195,8 +194,7 @@ def symplecticity_estimate(sol: Solution, directions: int = 8, seed: int = 0) ->
 
             moved = [to_numpy(jvp(one_step, x, v.expand_as(x))[1]) for v in u]
             before = _form(u.numpy()[i], u.numpy()[j]).reshape(-1, *[1] * (y.ndim - 1))
-            change = _form(np.stack(moved)[i], np.stack(moved)[j]) - before
-            squares = change.astype(float) ** 2 / (2 * d)
+            squares = (_form(np.stack(moved)[i], np.stack(moved)[j]) - before).astype(float) ** 2 / (2 * d)
             mean = np.where(np.isfinite(squares).all(0), squares.mean(0), np.inf)
             value = np.sqrt(mean)
             with np.errstate(all="ignore"):

@@ -362,8 +362,7 @@ class Appender:
         self.held = self.length % self.size
         if self.held:  # the last chunk, up to what was committed
             for name in self.axes:
-                index = self._index(name, self.length // self.size)
-                self.tails[name].append(store.committed(name, index))
+                self.tails[name].append(store.committed(name, self._index(name, self.length // self.size)))
 
     def _index(self, name: str, k: int) -> tuple[int, ...]:
         """The chunk k along the dimension; along the others there is one."""

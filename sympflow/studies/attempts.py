@@ -377,8 +377,7 @@ class Attempt:
 
 def largest(series: np.ndarray, sol: Solution) -> np.ndarray:
     """Maxima over time of a non-negative series, inf for trajectories that failed."""
-    worst = np.where(np.isnan(series), np.inf, series).max(axis=-1, initial=0.0)
-    return np.where(failed(sol), np.inf, worst)
+    return np.where(failed(sol), np.inf, np.where(np.isnan(series), np.inf, series).max(axis=-1, initial=0.0))
 
 
 # metrics ----------------------------------------------------------------------------------------------------------

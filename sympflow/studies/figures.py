@@ -162,8 +162,7 @@ def _dash(run: Attempt) -> str:
 
 
 def _drawable(comparison: Compared) -> tuple[str, ...]:
-    ran = any(run.sol is not None for run in comparison.runs)
-    return (*_panels(comparison), *(("portrait",) if ran else ()))
+    return (*_panels(comparison), *(("portrait",) if any(run.sol is not None for run in comparison.runs) else ()))
 
 
 def _panels(comparison: Compared) -> tuple[str, ...]:

@@ -186,8 +186,7 @@ class Conditions:
 
     def run(self, integrator: Any, t_span: tuple[float, float] | None = None, t: np.ndarray | None = None) -> Solution:
         """The solution from all initial states, or of a method that takes them one by one from a few."""
-        few = integrator.one_by_one and self.trajectories > SAMPLE
-        y0 = self.y0[:SAMPLE] if few else self.y0
+        y0 = self.y0[:SAMPLE] if integrator.one_by_one and self.trajectories > SAMPLE else self.y0
         times = self.t if t is None else t
         return solve(self.system, integrator, t_span or self.t_span, y0, t_eval=times, backend=self.backend)
 

@@ -623,8 +623,7 @@ def save_every_thins_the_outputs(integrator: Integrator, system: HamiltonianSyst
 
 def a_batch_reports_its_failures(integrator: Integrator, system: HamiltonianSystem) -> None:
     """The run of a batch, some of which blow up, has status −1 for these and 0 for the others."""
-    bad = 1e150 * np.ones(2 * system.ndof)
-    y0, times = np.stack([start(system), bad]), np.array([0.0, 8.0])
+    y0, times = np.stack([start(system), 1e150 * np.ones(2 * system.ndof)]), np.array([0.0, 8.0])
     with np.errstate(all="ignore"):
         outcome = integrator.run(Problem(system, 0.0, 8.0, y0, t_eval=times))
     finite, status = np.isfinite(np.asarray(outcome.y)).all(axis=(0, 2)), np.broadcast_to(outcome.status, (2,))
