@@ -58,8 +58,12 @@ def max_energy_error(sol: Solution, relative: bool = True) -> np.floating | np.n
     It is inf for a trajectory that became non-finite or could not be continued, however few of its outputs were stored
     before: a blow-up never looks small.
     """
-    error = np.abs(energy_error(sol, relative))
-    return np.where(failed(sol), np.inf, np.where(np.isnan(error), np.inf, error).max(axis=-1, initial=0.0))[()]
+    return largest(np.abs(energy_error(sol, relative)), sol)[()]
+
+
+def largest(series: np.ndarray, sol: Solution) -> np.ndarray:
+    """Maxima over time of a non-negative series, inf for trajectories that failed."""
+    return np.where(failed(sol), np.inf, np.where(np.isnan(series), np.inf, series).max(axis=-1, initial=0.0))
 
 
 def failed(sol: Solution) -> np.ndarray:
