@@ -555,7 +555,7 @@ def _look_for_poles(store: RunStore, piece: Outcome, integrator: Integrator, bef
     """Note that a run passed a pole between outputs of a window, and the state before them; of each trajectory once."""
     known = np.array(store.noted.get("failed_at", np.full(before.y0.shape[:-1], np.nan)), dtype=float)
     piece.status = np.where(np.isnan(known), 0, -1) if known.ndim else 0 if np.isnan(known) else -1
-    if note_poles(piece, integrator, before, None):
+    if any(each.certain for each in note_poles(piece, integrator, before, None)):
         at = np.where(np.isnan(known), piece.stats["failed_at"], known)
         store.noted |= {"failed_at": at.tolist(), "passed": store.noted.get("passed", piece.message)}
 

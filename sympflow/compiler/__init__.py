@@ -5,8 +5,13 @@ Read in this order: `numbers` (what arithmetic is done with), `functions` (one t
 conditions, memory), `elementary` (exp, log, sin and their kin by arithmetic alone) and `machine` (from text to code).
 """
 
-__all__ = ["NotCompiled"]
+__all__ = ["NotCompiled", "arrays_only"]
 
 
 class NotCompiled(ValueError):
     """The reason why code cannot be compiled; array operations may serve instead."""
+
+
+def arrays_only(reason: str) -> NotCompiled:
+    """Return the refusal of what array operations alone can do."""
+    return NotCompiled(f"{reason}: use backend='array'.")

@@ -145,7 +145,7 @@ class Arrangement:
             return self._power(args[0], constants[1])
         if name == "div":
             if constants[1] is not None:
-                return self._product(args[0], self.number_of(1.0 / constants[1]))
+                return self._product(args[0], Polynomial(self, {(): 1.0 / constants[1]}))
             if constants[0] is None or constants[0] != 1.0:
                 return self._product(args[0], self.apply("div", [self.number(1.0), args[1]]))
             if (inverse := self._inverse(args[1])) is not None:
@@ -198,9 +198,6 @@ class Arrangement:
         node = self.operation(name, *args)
         self._nodes[node.order], self._powers[node.order] = node, (base, 1 if name == "sqrt" else -2)
         return node.order
-
-    def number_of(self, coefficient: Any) -> Polynomial:
-        return Polynomial(self, {(): coefficient})
 
     def _sum(self, a: Polynomial | None, b: Polynomial, sign: float) -> Polynomial:
         terms = dict(a.terms) if a is not None else {}
@@ -361,9 +358,7 @@ class Arrangement:
                 lambda: self.operation("fma", x.write(), A.write(), B.write()),
             )
             yield Plan(
-                max(both + PRODUCT, B.depth) + SUM,
-                operations + 2,
-                lambda: self.operation("add", product(), B.write()),
+                max(both + PRODUCT, B.depth) + SUM, operations + 2, lambda: self.operation("add", product(), B.write())
             )
 
     def _one(self, m: Monomial, c: Any) -> Plan:

@@ -41,12 +41,12 @@ class Type(NamedTuple):
 
     @property
     def floating(self) -> bool:
-        return self.scalar in ("double", "float")
+        return self.scalar == "double"
 
     @property
     def suffix(self) -> str:
         """The type in names of intrinsics."""
-        short = {"double": "f64", "float": "f32"}.get(self.scalar, self.scalar)
+        short = "f64" if self.floating else self.scalar
         return short if self.width == 1 else f"v{self.width}{short}"
 
     def of(self, scalar: str) -> Type:
@@ -161,12 +161,7 @@ class Module:
         self._uses: dict[str, int] = {}
 
     def function(
-        self,
-        name: str,
-        arguments: Sequence[Type],
-        result: Type | None = None,
-        within: bool = False,
-        rare: bool = True,
+        self, name: str, arguments: Sequence[Type], result: Type | None = None, within: bool = False, rare: bool = True
     ) -> Code:
         """Begin a function; `within` for one that is called by the others only, `rare`ly, and not copied into them."""
         return Code(self, name, arguments, result, within, rare)
@@ -193,8 +188,7 @@ class Module:
 def literal(x: float, type: Type) -> str:
     """Return a constant as LLVM writes it."""
     if type.floating:
-        (narrow,) = struct.unpack("<f", struct.pack("<f", x)) if type.scalar == "float" else (x,)
-        text = f"0x{struct.unpack('<Q', struct.pack('<d', narrow))[0]:016X}"
+        text = f"0x{struct.unpack('<Q', struct.pack('<d', x))[0]:016X}"
     elif type.scalar == "i1":
         text = "true" if x else "false"
     else:
@@ -642,4 +636,4 @@ class Sweep:
         return phis, self._begun, made
 
 
-_SIZES = {"double": 8, "float": 4, "i64": 8, "i32": 4, "i1": 1, "ptr": 8}
+_SIZES = {"double": 8, "i64": 8, "i32": 4, "i1": 1, "ptr": 8}

@@ -2,7 +2,7 @@
 
 Each function reduces its argument by an identity, which a comment states, and evaluates a polynomial by Estrin's rule.
 What few arguments need, very large ones for instance, is given by the C library, one lane after the other, behind a
-branch that others never take. float32 is computed in double precision.
+branch that others never take.
 
 Errors in units in the last place, for all arguments: below 1 for exp and log, 3 for tanh, 2 for expm1, log1p, atan and
 powers; up to `FAR` 2 for sin, cos and tan, 3 on machines without fused operations. Angles beyond `FAR` have the errors
@@ -51,9 +51,6 @@ def _lowered(name: str, inline: int = INLINE) -> Callable[[Callable[..., Value]]
     def register(build: Callable[..., Value]) -> Callable[..., Value]:
         def lowered(*args: Any) -> Value:
             x: Value = args[0]
-            if x.type.scalar == "float":
-                wide = [x.code.convert("fpext", a, "double") if isinstance(a, Value) else a for a in args]
-                return x.code.convert("fptrunc", lowered(*wide), "float")
             full = f"{name}.{x.type.suffix}"
             if x.code.module.used(full) <= inline:
                 return build(*args)
@@ -408,14 +405,8 @@ def _circle_once(x: Value) -> list[Value]:
     return code.once(("circle", x.name), make)
 
 
-@_lowered("sin", inline=ALWAYS)
-def _sin(x: Value) -> Value:
-    return _circle_once(x)[0]
-
-
-@_lowered("cos", inline=ALWAYS)
-def _cos(x: Value) -> Value:
-    return _circle_once(x)[1]
+_lowered("sin", inline=ALWAYS)(lambda x: _circle_once(x)[0])
+_lowered("cos", inline=ALWAYS)(lambda x: _circle_once(x)[1])
 
 
 @_lowered("tan")
@@ -462,19 +453,9 @@ def _atan(x: Value) -> Value:
 # sign, min, max, mod --------------------------------------------------------------------------------------------------
 
 
-@_lowered("sign", inline=ALWAYS)
-def _sign(x: Value) -> Value:
-    return where(x > 0.0, 1.0, where(x < 0.0, -1.0, x))
-
-
-@_lowered("min", inline=ALWAYS)
-def _min(x: Value, y: Value) -> Value:
-    return where(_compare("uno", x, x), x, where(x < y, x, y))
-
-
-@_lowered("max", inline=ALWAYS)
-def _max(x: Value, y: Value) -> Value:
-    return where(_compare("uno", x, x), x, where(x > y, x, y))
+_lowered("sign", inline=ALWAYS)(lambda x: where(x > 0.0, 1.0, where(x < 0.0, -1.0, x)))
+_lowered("min", inline=ALWAYS)(lambda x, y: where(_compare("uno", x, x), x, where(x < y, x, y)))
+_lowered("max", inline=ALWAYS)(lambda x, y: where(_compare("uno", x, x), x, where(x > y, x, y)))
 
 
 @_lowered("mod")
@@ -482,17 +463,14 @@ def _mod(x: Value, y: Value) -> Value:
     """x − ⌊x/y⌋ y, of the sign of y, as in Python."""
     q = _floor(x / y)
     far = _compare("uge", abs(q), 2.0**52) | _compare("oeq", abs(y), INFINITY)
-    return _guarded("mod", far, _mod_of(_rest(q, y, x), y), x, y, slow=_mod_far)
+    slow = lambda x, y: _mod_of(_by_library(x, y, name="fmod"), y)  # noqa: E731
+    return _guarded("mod", far, _mod_of(_rest(q, y, x), y), x, y, slow=slow)
 
 
 def _mod_of(r: Value, y: Value) -> Value:
     """The remainder of the sign of y."""
     other = ((r.bits ^ y.bits) < 0) & _compare("une", r, 0.0)
     return _signed(where(other, r + y, r), y)
-
-
-def _mod_far(x: Value, y: Value) -> Value:
-    return _mod_of(_by_library(x, y, name="fmod"), y)
 
 
 # the C library, lane by lane ------------------------------------------------------------------------------------------

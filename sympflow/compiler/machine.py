@@ -65,7 +65,9 @@ def compiled(text: str, name: str, signature: Any) -> Any:
             if code is None:
                 code = _object_code(text)
                 _store(key, code)
-            engine = _LOADED[key] = _engine(code)
+            engine = _LOADED[key] = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _target())
+            engine.add_object_file(llvm.ObjectFileRef.from_data(code))
+            engine.finalize_object()
     return signature(engine.get_function_address(name))
 
 
@@ -110,13 +112,6 @@ def _object_code(text: str) -> bytes:
         if not function.is_declaration:
             passes.run(function, builder)
     return target.emit_object(module)
-
-
-def _engine(code: bytes) -> Any:
-    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _target())
-    engine.add_object_file(llvm.ObjectFileRef.from_data(code))
-    engine.finalize_object()
-    return engine
 
 
 def _folder() -> Path | None:

@@ -76,7 +76,7 @@ class Recording:
             if found is not None:
                 return found
         if name in _COMMUTE:
-            args = tuple(sorted(args, key=_place))
+            args = tuple(sorted(args, key=lambda x: (1, x.order) if isinstance(x, Traced) else (0, x)))
         return self._number(name, args)
 
     def _as_number(self, x: Any) -> Any:
@@ -96,21 +96,9 @@ def _constant(x: Any) -> float:
     raise TypeError(f"a number that is traced cannot be combined with {type(x).__name__}: give floats.")
 
 
-def _place(x: Any) -> tuple[int, float]:
-    return (1, x.order) if isinstance(x, Traced) else (0, x)
-
-
 MOST_DERIVED = 5000  # operations through which derivatives of single outputs are taken
 MOST_ROOTS = 8.5  # powers that are written as powers of a root
 _COMMUTE = {"add", "mul", "times", "min", "max", "eq", "and", "or"}
-
-
-def _sum(a: Any, b: Any) -> Any:
-    return b if _is(a, 0.0) else a if _is(b, 0.0) else None
-
-
-def _difference(a: Any, b: Any) -> Any:
-    return a if _is(b, 0.0) else -b if _is(a, 0.0) else 0.0 if a is b else None
 
 
 def _product(a: Any, b: Any, name: str = "mul") -> Any:
@@ -134,10 +122,6 @@ def _quotient(a: Any, b: Any) -> Any:
     if isinstance(b, float) and b != 0:
         return a * (1.0 / b) if _halves(b) else None  # exact
     return 0.0 if _is(a, 0.0) else None
-
-
-def _negative(a: Any) -> Any:
-    return a.args[0] if a.name == "neg" else a.args[1] - a.args[0] if a.name == "sub" else None
 
 
 def _power(x: Any, n: Any) -> Any:
@@ -168,12 +152,12 @@ def _choice(condition: Any, a: Any, b: Any) -> Any:
 
 
 _SIMPLER: dict[str, Callable[..., Any]] = {
-    "add": _sum,
-    "sub": _difference,
+    "add": lambda a, b: b if _is(a, 0.0) else a if _is(b, 0.0) else None,
+    "sub": lambda a, b: a if _is(b, 0.0) else -b if _is(a, 0.0) else 0.0 if a is b else None,
     "mul": _product,
     "times": lambda a, b: _product(a, b, "times"),
     "div": _quotient,
-    "neg": _negative,
+    "neg": lambda a: a.args[0] if a.name == "neg" else a.args[1] - a.args[0] if a.name == "sub" else None,
     "pow": _power,
     "fma": _fused,
     "where": _choice,

@@ -11,7 +11,7 @@ import math
 import operator
 import warnings
 from collections.abc import Callable, Sequence
-from functools import reduce
+from functools import partial, reduce
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -198,7 +198,7 @@ def _array(x: Any, kind: type[TracedArray] = TracedArray) -> TracedArray:
 
 def _wrapped(x: Any, kind: type[TracedArray]) -> Any:
     """A result of raw arrays as it is given to the function again."""
-    if isinstance(x, Traced) or (isinstance(x, np.ndarray) and x.dtype == object):
+    if isinstance(x, Traced | float) or (isinstance(x, np.ndarray) and x.dtype == object):
         return _array(x, kind)
     return type(x)(_wrapped(y, kind) for y in x) if type(x) in (list, tuple, _Extremes) else x
 
@@ -237,10 +237,6 @@ def _not(x: Any) -> Any:
     return apply("not", x)
 
 
-def _heaviside(x: Any, at_zero: Any) -> Any:
-    return _choose(apply("eq", x, 0.0), at_zero, _choose(apply("lt", 0.0, x), 1.0, 0.0))
-
-
 def _truncated(x: Any) -> Any:
     return _choose(apply("lt", x, 0.0), -apply("floor", -x), apply("floor", x))
 
@@ -252,10 +248,6 @@ def _nearest(x: Any) -> Any:
 
 def _logaddexp(x: Any, y: Any) -> Any:
     return apply("max", x, y) + apply("log1p", apply("exp", -abs(x - y)))
-
-
-def _sigmoid(x: Any) -> Any:
-    return 1.0 / (1.0 + apply("exp", -x))
 
 
 def _softplus(x: Any) -> Any:
@@ -305,8 +297,9 @@ ELEMENTS: dict[str, Callable[..., Any]] = {
     "isfinite": lambda x: apply("lt", abs(x), math.inf),
     "deg2rad": lambda x: x * (math.pi / 180), "radians": lambda x: x * (math.pi / 180),
     "rad2deg": lambda x: x * (180 / math.pi), "degrees": lambda x: x * (180 / math.pi),
-    "copysign": lambda x, y: abs(x) * _choose(apply("lt", y, 0.0), -1.0, 1.0), "heaviside": _heaviside,
-    "logaddexp": _logaddexp, "expit": _sigmoid, "log_expit": lambda x: -_softplus(-x),
+    "copysign": lambda x, y: abs(x) * _choose(apply("lt", y, 0.0), -1.0, 1.0),
+    "heaviside": lambda x, zero: _choose(apply("eq", x, 0.0), zero, _choose(apply("lt", 0.0, x), 1.0, 0.0)),
+    "logaddexp": _logaddexp, "expit": lambda x: 1.0 / (1.0 + apply("exp", -x)), "log_expit": lambda x: -_softplus(-x),
     "xlogy": lambda x, y: _choose(apply("eq", x, 0.0), 0.0, x * apply("log", y)),
     **{name: _of(name) for name in OF_SCIPY}, **{f"{f}{n}": lambda x, f=f, n=n: apply(f"{f}v", float(n), x)
        for f in "jyik" for n in (0, 1)},
@@ -572,10 +565,8 @@ _SELF = lambda x, *_, **__: x  # noqa: E731
 # fmt: off
 TORCH: dict[str, Callable[..., Any]] = {
     "add": lambda x, y, alpha=1: x + alpha * y, "sub": lambda x, y, alpha=1: x - alpha * y,
-    "mul": lambda x, y: x * y, "div": lambda x, y: x / y, "pow": lambda x, n: _each("power", x, n),
-    "rsub": lambda x, y: y - x, "rpow": lambda x, y: _each("power", y, x), "neg": lambda x: -x,
-    "abs": lambda x: _each("absolute", x), "square": lambda x: x * x, "rsqrt": lambda x: 1.0 / _each("sqrt", x),
-    "sigmoid": lambda x: _each("expit", x), "softplus": _smooth_ramp,
+    "mul": lambda x, y: x * y, "div": lambda x, y: x / y, "rsub": lambda x, y: y - x, "neg": lambda x: -x,
+    "rpow": lambda x, y: _each("power", y, x), "rsqrt": lambda x: 1.0 / _each("sqrt", x), "softplus": _smooth_ramp,
     "silu": lambda x, **_: x * _each("expit", x), "relu": lambda x, **_: _each("maximum", x, 0.0), "gelu": _gelu,
     "elu": lambda x, alpha=1.0, **_: _elu(x, alpha), "celu": lambda x, alpha=1.0, **_: _elu(x, alpha, alpha),
     "leaky_relu": lambda x, slope=0.01, **o: _where(_each("less", 0.0, x), x, o.get("negative_slope", slope) * x),
@@ -597,11 +588,9 @@ TORCH: dict[str, Callable[..., Any]] = {
     "logsumexp": lambda x, axis, keepdims=False: np.frompyfunc(_logaddexp, 2, 1).reduce(
         _objects(x), axis=axis, keepdims=keepdims), "softmax": _softmax,
     "max": _extremes("maximum"), "min": _extremes("minimum"), "amax": _extreme("maximum"), "amin": _extreme("minimum"),
-    "maximum": lambda x, y: _each("maximum", x, y), "minimum": lambda x, y: _each("minimum", x, y),
     "clamp": lambda x, min=None, max=None: _clip(x, min, max), "clamp_min": _clip,
-    "clamp_max": lambda x, high: _clip(x, None, high), "fmod": lambda x, y: _each("fmod", x, y),
-    "remainder": lambda x, y: _each("remainder", x, y), "mod": lambda x, y: _each("remainder", x, y),
-    "where": _where, "det": _det, "linalg_det": _det, "linalg_inv": _inv, "inverse": _inv, "linalg_solve": _solve,
+    "clamp_max": lambda x, high: _clip(x, None, high), "where": _where,
+    "det": _det, "linalg_det": _det, "linalg_inv": _inv, "inverse": _inv, "linalg_solve": _solve,
     "matmul": np.matmul, "mm": np.matmul, "mv": np.matmul, "bmm": np.matmul, "dot": np.dot, "inner": np.inner,
     "outer": np.outer, "ger": np.outer, "tensordot": lambda x, y, dims=2, axis=None: np.tensordot(
         x, y, dims if axis is None else axis), "trace": np.trace, "vecdot": lambda x, y, axis=-1: (x * y).sum(axis),
@@ -623,25 +612,21 @@ TORCH: dict[str, Callable[..., Any]] = {
     "zeros_like": _like(0.0), "ones_like": _like(1.0), "full_like": ARRAYS["full_like"],
     "new_zeros": lambda x, *n, **_: np.zeros(_flat(n)).astype(object), "numel": np.size, "dim": np.ndim,
     "clone": lambda x, **_: np.array(x), "contiguous": _SELF, "to": _SELF, "double": _SELF, "type": _SELF,
-    "type_as": _SELF, "positive": _SELF, "lgamma": lambda x: _each("gammaln", x),
-    "digamma": lambda x: _each("psi", x), "special_erf": lambda x: _each("erf", x),
-    "special_erfc": lambda x: _each("erfc", x), "special_expit": lambda x: _each("expit", x),
-    "special_gammaln": lambda x: _each("gammaln", x), "atan2": lambda x, y: _each("arctan2", x, y),
-    "logaddexp": lambda x, y: _each("logaddexp", x, y), "heaviside": lambda x, y: _each("heaviside", x, y),
-    "hypot": lambda x, y: _each("hypot", x, y), "sinc": ARRAYS["sinc"],
+    "type_as": _SELF, "positive": _SELF, "sinc": ARRAYS["sinc"],
     "any": ARRAYS["any"], "all": ARRAYS["all"], "is_floating_point": lambda x: True, "is_complex": lambda x: False,
-    **{name: (lambda x, name=f"arc{name[1:]}": _each(name, x)) for name in (
-        "asin", "acos", "atan", "asinh", "acosh", "atanh")},
-    **{f"arc{name}": (lambda x, name=f"arc{name}": _each(name, x)) for name in (
-        "sin", "cos", "tan", "sinh", "cosh", "tanh")},
-    **{name: (lambda x, name=name: _each(name, x)) for name in (
+    **{name: partial(_each, f"arc{name.removeprefix('arc').removeprefix('a')}") for name in (
+        "asin", "acos", "atan", "asinh", "acosh", "atanh", "arcsin", "arccos", "arctan", "arcsinh", "arccosh",
+        "arctanh", "atan2")},
+    **{name: partial(_each, name) for name in (
         "exp", "exp2", "expm1", "log", "log2", "log10", "log1p", "sin", "cos", "tan", "tanh", "sinh", "cosh", "sqrt",
-        "sign", "floor", "ceil", "trunc", "erf", "erfc", "reciprocal", "deg2rad", "rad2deg")},
-    **{short: (lambda x, y, name=name: _each(name, x, y)) for short, name in (
+        "sign", "floor", "ceil", "trunc", "erf", "erfc", "reciprocal", "deg2rad", "rad2deg", "square", "fmod", "hypot",
+        "maximum", "minimum", "remainder", "logaddexp", "heaviside", "logical_and", "logical_or", "logical_not")},
+    **{name: partial(_each, of) for name, of in (
         ("lt", "less"), ("le", "less_equal"), ("gt", "greater"), ("ge", "greater_equal"), ("eq", "equal"),
-        ("ne", "not_equal"), ("logical_and", "logical_and"), ("logical_or", "logical_or"), ("and", "logical_and"),
-        ("or", "logical_or"))},
-    "logical_not": lambda x: _each("logical_not", x), "invert": lambda x: _each("logical_not", x),
+        ("ne", "not_equal"), ("and", "logical_and"), ("or", "logical_or"), ("invert", "logical_not"),
+        ("abs", "absolute"), ("pow", "power"), ("mod", "remainder"), ("sigmoid", "expit"), ("lgamma", "gammaln"),
+        ("digamma", "psi"), ("special_erf", "erf"), ("special_erfc", "erfc"), ("special_expit", "expit"),
+        ("special_gammaln", "gammaln"))},
 }
 # fmt: on
 _LONG = {"subtract": "sub", "multiply": "mul", "divide": "div", "truediv": "div", "negative": "neg", "absolute": "abs"}

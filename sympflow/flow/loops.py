@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.compiler import NotCompiled
+from sympflow.compiler import arrays_only
 from sympflow.flow.tables import Tables
 from sympflow.hamiltonian.collocation import Tableau
 from sympflow.hamiltonian.parts import ExactParts
@@ -33,9 +33,8 @@ class PrimedFlowKernel(Kernel):
         system.friction.check_sums(compensated)
         known = system.form is not None or (tables.level == CURVATURE and system.local is not None)
         if tables.level >= CURVATURE and not known:
-            raise NotCompiled(
-                f"`system` {system.name!r} has no symbols, from which curvature terms and polynomials are compiled: "
-                "use backend='array'."
+            raise arrays_only(
+                f"`system` {system.name!r} has no symbols, from which curvature terms and polynomials are compiled"
             )
         self.system = system
         self._tables, self._splitting, self._compensated = tables, splitting_loops(system), compensated

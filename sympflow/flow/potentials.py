@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from sympflow.arguments import plain
 from sympflow.arrays import jvp
-from sympflow.compiler import NotCompiled
+from sympflow.compiler import arrays_only
 from sympflow.flow.weights import check_memory, checked_device, checked_dtype
 from sympflow.lazy import announced, distribution, load_announced
 
@@ -489,10 +489,7 @@ class MLPPotential(Potential):
         from sympflow.kernels.networks import NetworkLayer
 
         if self.features:
-            raise NotCompiled(
-                "`flow` has networks that take the time of the state, and these have no compiled form: use "
-                "backend='array'."
-            )
+            raise arrays_only("`flow` has networks that take the time of the state, and these have no compiled form")
         K, k, b, W, w = self.folded()
 
         def array(weight: Tensor) -> np.ndarray:

@@ -31,11 +31,13 @@ from sympflow.arrays import (
     unfollowed,
     values,
 )
+from sympflow.compiler.program import Program, derivatives, gradient, reached, traced
 from sympflow.compiler.tracing import WEIGHTS, Untraceable, trace, trace_chain
 from sympflow.hamiltonian.definition import Definition
 from sympflow.hamiltonian.formulas import TracedHamiltonian, TracedPoles, without_overflow
 from sympflow.hamiltonian.function_checks import Tested, check_writes, probe_states, test
 from sympflow.hamiltonian.layered import LayeredPotential
+from sympflow.hamiltonian.linear_part import simplest
 from sympflow.hamiltonian.times import probe_times
 
 MOST_BY_ARRAYS = 2000  # operations of a gradient, beyond which torch differentiates its own functions of arrays
@@ -48,6 +50,10 @@ class CallableHamiltonian(Definition):
 
     library: str = ""  # "numpy" or "torch", whose arrays the functions take; "" if they fail on both
     untraced: str = ""
+    _kinetic: Program | None = None  # T of p, of an H that is found to be a sum, where T is not quadratic
+    kinetic: Callable[..., Array]
+    kinetic_gradient: Callable[..., Array]
+    kinetic_hessian: Callable[..., Array]
     guard: Callable[[], None] | None = None  # refuses a system of which something else has changed
     _scene: tuple[Any, ...] = (None, None, None, (0.0, 1.0))
     _functions: tuple[Any, Any, Any, Any]
@@ -77,6 +83,33 @@ class CallableHamiltonian(Definition):
             functions = V, None, slope, None if hessian_vector is None else product
         of_arrays = [None if f is None else _OverTimes(f) if timed else f for f in functions]
         self._potential, self._hamiltonian, self._gradient, self._hessian_vector = of_arrays
+
+    def as_sum(self) -> tuple[CallableHamiltonian, np.ndarray | None, bool] | None:
+        """The definition of H = T(p) + V(q) by V, M⁻¹, and whether T = ½ pᵀM⁻¹p; None of an H that is no such sum."""
+        form, d = self.form, self.ndof
+        if form is None or self.separable:
+            return None
+        H, inputs = form.program, form.program.inputs
+        slopes = gradient(H.outputs[0], inputs[-d:])
+        if {x.order for x in inputs[:-d]} & {x.order for x in reached(slopes)}:
+            return None
+        made = CallableHamiltonian(d, _AtRest(self._functions[1]), None, None, None, self.given, self.timed)
+        made.guard = self.check_unchanged
+        M, nothing = derivatives(slopes, inputs[-d:]), [0.0] * d
+        constant = all(isinstance(x, float) for row in M for x in row)
+        moves = any(Program(inputs, slopes)(*[0.0] * len(inputs)))  # at p = 0
+        if constant and not moves and np.linalg.eigvalsh(M)[0] > 0:
+            return made, simplest(np.array(M)), True
+        state, t, _ = self._known
+        elsewhere = [t] * self.timed + state[:d].tolist()
+
+        def kinetic(*p: Any) -> list[Any]:
+            return [H(*elsewhere, *p)[0] - H(*elsewhere, *nothing)[0]]
+
+        T = TracedHamiltonian(d, traced(kinetic, *(f"p{i + 1}" for i in range(d))), False)
+        made._kinetic, made.kinetic = T.program, T.value
+        made.kinetic_gradient, made.kinetic_hessian = T.gradient, T.hessian
+        return made, None, False
 
     def identity_parts(self) -> Any:
         return [self.ndof, self._functions] if self.timed else [self.ndof, *self._functions]
@@ -157,7 +190,7 @@ class CallableHamiltonian(Definition):
 
     @property
     def _name(self) -> str:
-        return "potential" if self.separable else "hamiltonian"
+        return "potential" if self.separable and not isinstance(self._functions[0], _AtRest) else "hamiltonian"
 
     @property
     def _given_function(self) -> Callable[..., Any]:
@@ -174,7 +207,7 @@ class CallableHamiltonian(Definition):
         d = self.ndof
         names: list[Any] = [[f"{letter}{i + 1}" for i in range(d)] for letter in "qp"[: 2 - self.separable]]
         program = without_overflow(trace(f, ["t", *names] if self.timed else names, self.library == "torch"))
-        form = TracedHamiltonian(d, program, self.separable, inverse_mass, self.timed)
+        form = TracedHamiltonian(d, program, self.separable, inverse_mass, self.timed, self._kinetic)
         at = (np.array(times),) if self.timed else ()
         x = states[:, :d] if self.separable else states
         if not np.isfinite(values).any():
@@ -416,9 +449,9 @@ class CallableHamiltonian(Definition):
             return function(*times, *states)
         refused = f"`{name}` writes into its argument, the state of the run: let it work on a copy"
         if is_tensor(states[0]):
-            versions = [getattr(x, "_version", 0) for x in states]
+            versions = [*map(_version, states)]
             value = function(*times, *states)
-            if versions != [getattr(x, "_version", 0) for x in states]:
+            if versions != [*map(_version, states)]:
                 raise ValueError(f"{refused}, q.clone().")
             return value
         views = [x[...] for x in states]  # the flag is not that of the caller's array
@@ -522,7 +555,7 @@ def _with_torch(
     import torch
 
     tensor = x if is_tensor(x) else torch.from_numpy(np.ascontiguousarray(x))
-    version, value, failure = tensor._version, None, None
+    version, value, failure = _version(tensor), None, None
     untraced, of_numpy = reason
     with warnings.catch_warnings() if of_numpy else nullcontext():
         if of_numpy:
@@ -545,10 +578,15 @@ def _with_torch(
             f"`{name}` failed on a torch tensor of shape {tuple(x.shape)} ({failure}){traced}. Write it with NumPy's "
             "or torch's functions of (..., d) arrays, or pass `gradient` as well, or use HamiltonianSystem.from_sympy."
         ) from failure
-    if tensor._version != version:
+    if _version(tensor) != version:
         raise ValueError(f"`{name}` writes into its argument, the state of the run: let it work on a copy, q.clone().")
     value = _checked(value, tensor, name, tail)
     return of_library(value, x)
+
+
+def _version(x: Any) -> int:
+    """The count of what was written into a tensor, which torch leaves out in its inference mode."""
+    return 0 if x.is_inference() else int(x._version)
 
 
 def _checked(value: Any, x: Array, name: str, tail: tuple[int, ...]) -> Array:
@@ -572,6 +610,16 @@ def _checked(value: Any, x: Array, name: str, tail: tuple[int, ...]) -> Array:
     if value.is_complex() if tensor else value.dtype.kind not in "fiub":
         raise TypeError(f"`{name}` must return real numbers; got {value.dtype}. Take the real part.")
     return value.to(x.dtype) if tensor else value.astype(x.dtype, copy=False)
+
+
+class _AtRest:
+    """V(q) = H(q, 0) of an H that is a sum T(p) + V(q), with the time first where there is one."""
+
+    def __init__(self, hamiltonian: Callable[..., Any]) -> None:
+        self.hamiltonian = hamiltonian
+
+    def __call__(self, *arguments: Any) -> Any:
+        return self.hamiltonian(*arguments, library(arguments[-1]).zeros_like(arguments[-1]))
 
 
 _ARGUMENTS = {"potential": "q", "hamiltonian": "q, p", "gradient": "q", "hessian_vector": "q, v"}

@@ -26,9 +26,10 @@ if TYPE_CHECKING:
 
 MOST_IN_SYMBOLS = 300  # operations
 _JUMPING = {"sign", "floor", "mod", "where", "lt", "le", "eq", "atan2"}
-_SINGULAR = {"div": 1} | dict.fromkeys(
-    ("pow", "log", "log1p", "tan", "sqrt", "acos", "asin", "acosh", "atanh", "gamma", "lgamma", "digamma", "ellipk"), 0
-)
+_SINGULAR = {"div": 1} | dict.fromkeys((
+    "pow", "log", "log1p", "tan", "sqrt", "acos", "asin", "acosh", "atanh", "gamma", "lgamma", "digamma", "ellipk",
+    "bose", "csch",
+), 0)  # fmt: skip
 """The argument by which an operation is infinite or no number."""
 _AS_THEIR_ARGUMENTS = {"abs", "neg", "sqrt", "pow", "mul", "times"}
 _POLYNOMIAL = {"add", "sub", "mul", "times", "neg", "fma"}
@@ -104,7 +105,13 @@ class TracedHamiltonian:
     samples: Mapping[str, Any] = MappingProxyType({})
 
     def __init__(
-        self, ndof: int, program: Program, separable: bool, inverse_mass: np.ndarray | None = None, timed: bool = False
+        self,
+        ndof: int,
+        program: Program,
+        separable: bool,
+        inverse_mass: np.ndarray | None = None,
+        timed: bool = False,
+        kinetic: Program | None = None,
     ) -> None:
         self.ndof, self.program, self.separable = ndof, program, separable
         self.q = tuple(Variable(f"q{i + 1}") for i in range(ndof))
@@ -117,10 +124,12 @@ class TracedHamiltonian:
         if not separable:
             self.H = Formula(program, (*times, *self.q, *self.p))
             return
-        M = np.ones(ndof) if inverse_mass is None else inverse_mass
-        M = np.diag(M) if M.ndim == 1 else M
-        self.inverse_mass = Entries(M)
-        self.T = Formula(traced(lambda *p: [_kinetic(M, p)], *(s.name for s in self.p)), self.p)
+        if kinetic is None:
+            M = np.ones(ndof) if inverse_mass is None else inverse_mass
+            M = np.diag(M) if M.ndim == 1 else M
+            self.inverse_mass = Entries(M)
+            kinetic = traced(lambda *p: [_kinetic(M, p)], *(s.name for s in self.p))
+        self.T = Formula(kinetic, self.p)
         self._set_potential(Formula(program, (*times, *self.q)))
 
     def _set_potential(self, V: Formula) -> None:

@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from sympflow.arrays import Array, concatenate, is_tensor, largest, library, like, of_library, per_state
+from sympflow.arrays import Array, concatenate, is_tensor, largest, library, like, of_library, per_state, to_numpy
 from sympflow.hamiltonian.definition import bare_copy
 from sympflow.hamiltonian.formulas import TracedHamiltonian, recorded
 from sympflow.hamiltonian.friction import FRICTIONLESS, Friction
+from sympflow.hamiltonian.linear_part import checked_inverse_mass
 from sympflow.hamiltonian.times import checked_time
 from sympflow.show.cards import Shown
 
@@ -72,6 +73,8 @@ class Hamiltonian:
     autonomous: bool = True
     period: float | None = None
     energy_scale: float | None = None
+    followed_mass: Any = None
+    """M as a tensor that torch follows, which may change."""
     external_force: Any = None
     """F(q, p, *t) of a physical limit, p' = −∂H/∂q + F, (..., d), with its `jacobian`; part of `vector_field`."""
 
@@ -81,7 +84,7 @@ class Hamiltonian:
         self.symbols: Any = definition.symbols
         self.ndof: int = definition.ndof
         self.separable: bool = definition.separable
-        self.inverse_mass = inverse_mass
+        self._inverse_mass = inverse_mass
         if inverse_mass is not None:
             inverse_mass.setflags(write=False)  # a part of H, of which code is generated
         self.quadratic_kinetic = quadratic_kinetic
@@ -401,6 +404,9 @@ class Hamiltonian:
         """∇T(p): (..., d) to (..., d)."""
         if not self._separable().quadratic_kinetic:
             return self.definition.kinetic_gradient(p, *self._kinetic_time(t, p))
+        if self.followed_mass is not None and is_tensor(p):
+            mass = self.followed_mass.to(p)
+            return p / mass if mass.ndim < 2 else p @ mass.inverse().mT
         if self.inverse_mass is None:
             return p
         M = like(self.inverse_mass, p)
@@ -458,6 +464,13 @@ class Hamiltonian:
         return self
 
     @property
+    def inverse_mass(self) -> np.ndarray | None:
+        """M⁻¹, (d,) or (d, d), as it is now; None when it is the identity or T is not quadratic."""
+        if self.followed_mass is None:
+            return self._inverse_mass
+        return checked_inverse_mass(to_numpy(self.followed_mass), self.ndof)
+
+    @property
     def local(self) -> LocalHamiltonian | None:
         """The definition by one piece, of a lattice or of pairs, with what it has of its own, such as `shape`."""
         return self.definition if self.definition.loops else None
@@ -465,16 +478,24 @@ class Hamiltonian:
     @property
     def form(self) -> SymbolicHamiltonian | TracedHamiltonian | None:
         """The definition that programs are recorded of: symbols, or functions that were traced; else None."""
+        if self.followed_mass is not None:  # which is a number in programs
+            return None
         return self.symbols if self.symbols is not None else self.definition.form
 
     @property
     def layered(self) -> LayeredPotential | None:
         """V as a chain of linear layers whose weights torch follows, of functions that are one; else None."""
-        return self.definition.layered
+        return None if self.followed_mass is not None else self.definition.layered
+
+    def learns(self, y: Array) -> bool:
+        """Return True if torch follows numbers of H at the states y (..., 2d), such as weights or masses."""
+        return self.followed_mass is not None or self.definition.learns(y)
 
     @property
     def untraced(self) -> str:
         """The reason for which Python functions could not be traced, a clause; "" if they were, or there are none."""
+        if self.followed_mass is not None:
+            return "`mass` requires gradients, which flow by tensor operations"
         return "" if self.form is not None else self.definition.untraced
 
     @property

@@ -212,6 +212,11 @@ def linear_part(system: Any) -> LinearPart:
     follows; or if the system has friction.
     """
     check_parts_conservative(system)
+    if system.followed_mass is not None:
+        raise ValueError(
+            "`mass` requires gradients, which do not flow through the exact linear part: take a method on the "
+            "splitting 'kinetic', such as 'srkn11b', or pass mass.detach()."
+        )
     part: LinearPart | None
     if system.stiffness_matrix is not None:
         K = system.stiffness_matrix

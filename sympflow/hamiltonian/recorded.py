@@ -11,7 +11,7 @@ from typing import Any
 import sympy as sp
 from sympy.core.relational import Relational
 
-from sympflow.compiler import NotCompiled
+from sympflow.compiler import NotCompiled, arrays_only
 from sympflow.compiler.functions import MOST_DERIVATIVES, apply, where
 from sympflow.compiler.program import Program, Traced
 from sympflow.hamiltonian.removable import (
@@ -124,9 +124,7 @@ def check_recorded(f: sp.Expr) -> None:
     """Raise a ValueError with the term of an expression of which `calculated` has no rule for a function."""
     for term in sp.Add.make_args(f):
         if not can_be_recorded(term):
-            raise NotCompiled(
-                f"`system` has the term {term}, for which there is no compiled function: use backend='array'."
-            )
+            raise arrays_only(f"`system` has the term {term}, for which there is no compiled function")
 
 
 def calculated(f: sp.Basic, value: Callable[[sp.Basic], Any]) -> Any:

@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sympflow.arguments import advice, check_flag, check_positive, checked_count, floats, real_number, told, warn
-from sympflow.arrays import Array, one_lane
+from sympflow.arrays import Array, differentiable, is_tensor, one_lane, to_numpy
+from sympflow.hamiltonian.definition import bare_copy
 from sympflow.hamiltonian.domain import Domain, domain_of
 from sympflow.hamiltonian.fingerprint import fingerprint
 from sympflow.hamiltonian.friction import Friction
@@ -169,11 +170,12 @@ class HamiltonianSystem(Hamiltonian, Answering):
         compiled. A function that writes into q is a ValueError; so is a gradient that is not that of V: see
         `check_functions`.
     hamiltonian : callable, optional
-        H(q, p), for a system that is not separable. Give this or `potential`.
+        H(q, p). Give this or `potential`. Where H is traced and found to be T(p) + V(q), the system is separable.
     ndof : int
         Degrees of freedom d.
     mass : float or array_like of shape (d,) or (d, d), optional
-        M, symmetric positive definite; the default is 1. Only with `potential`.
+        M, symmetric positive definite; the default is 1. Only with `potential`. To a tensor that requires gradients
+        these flow, by tensor operations: runs are not compiled then.
     gradient : callable, optional
         ∇V(q), (..., d) to (..., d); as a Numba function: gradient(q, out).
     hessian_vector : callable, optional
@@ -286,9 +288,17 @@ class HamiltonianSystem(Hamiltonian, Answering):
         for argument, value in (("mass", mass), ("stiffness_matrix", stiffness_matrix)):
             if value is not None and not definition.separable:
                 raise TypeError(f"`{argument}` only goes with `potential`: leave it out, it is part of `hamiltonian`.")
-        inverse_mass = checked_inverse_mass(mass, d) if definition.separable else None
+        M: Any = mass
+        followed = M if is_tensor(M) and (M.requires_grad or differentiable(M)) else None
+        M = M if followed is None else to_numpy(M)
+        inverse_mass, quadratic = checked_inverse_mass(M, d) if definition.separable else None, definition.separable
         K = None if stiffness_matrix is None else checked_stiffness(stiffness_matrix, d)
-        self._make(definition, inverse_mass, definition.separable, {}, settled, damping, period, K)
+        if hamiltonian is not None:
+            domain = settled.domain if isinstance(settled.domain, Domain) else None
+            definition.place(settled.state(d), domain, None, settled.t_span)
+            definition, inverse_mass, quadratic = definition.as_sum() or (bare_copy(definition), None, False)
+        self.followed_mass = followed
+        self._make(definition, inverse_mass, quadratic, {}, settled, damping, period, K)
 
     @classmethod
     def from_sympy(

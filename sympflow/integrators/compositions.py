@@ -149,11 +149,9 @@ class KineticPotential(Composition):
     def __init__(self, method: str, scheme: Scheme, system: HamiltonianSystem) -> None:
         self.method, self.scheme, self.system = method, scheme, system
         if not system.separable:
-            is_sum = system.written is not None and system.written.separable
             raise ValueError(
-                f"`method` {method!r} needs a separable system, H = T(p) + V(q), and {system.name!r} is "
-                + ("given by one function: define it with V as `potential` and M as `mass`, or " if is_sum else "not: ")
-                + f"use {system.definition.instead}."
+                f"`method` {method!r} needs a separable system, H = T(p) + V(q), and {system.name!r} is not: use "
+                f"{system.definition.instead}."
             )
         if (scheme.nystrom or scheme.level) and not system.quadratic_kinetic:
             raise ValueError(

@@ -62,20 +62,23 @@ MANY_TIMES = 1000.0  # times the certified energy error of a flow beyond which a
 _TOLD: WeakSet[Any] = WeakSet()
 
 
-def diagnose_piece(outcome: Outcome, integrator: Integrator, problem: Problem, rows: ParameterRows | None) -> None:
-    """Note poles that a run passed, digits that it lost, and when the solution of one that failed becomes infinite."""
+def diagnose_piece(outcome: Outcome, integrator: Integrator, problem: Problem, rows: ParameterRows | None) -> bool:
+    """Note poles that a run passed, if any, digits that it lost, and when the solution of one that failed ends."""
     system, failed = problem.system, _failed(outcome)
     looked = system.definition.poles is not None or problem.parameter_values is not None
     if not problem.diagnosed or not (failed or looked) or not readable(outcome.y):
-        return
-    passed, plain = False, problem.parameter_values is None
+        return False
+    found: list[Passage] = []
+    plain = problem.parameter_values is None
     if problem.store is None and looked:
         if not failed or np.any(np.asarray(outcome.status) >= 0):
-            passed = note_poles(outcome, integrator, problem, rows)
+            found = note_poles(outcome, integrator, problem, rows)
         if plain:
             warn_of_cancelling(outcome, problem)
+    passed = any(each.certain for each in found)
     if plain and (failed or passed):
         note_singularities(outcome, integrator, problem, passed)
+    return bool(found)
 
 
 def diagnose(
@@ -88,11 +91,11 @@ def diagnose(
 ) -> None:
     """Look at the outcome of a run: what it shows ends it, is added to its message, or is warned of."""
     system, y0 = problem.system, problem.y0
-    if not interrupted:
-        diagnose_piece(outcome, integrator, problem, rows)
+    told = not interrupted and diagnose_piece(outcome, integrator, problem, rows)
     values, between = readable(outcome.y), system.between_impulses
     held = values and problem.store is None and not _failed(outcome)
-    told = held and system.definition.leaps and problem.parameter_values is None and warn_of_leap(outcome, system, y0)
+    if held and system.definition.leaps and problem.parameter_values is None:
+        told = warn_of_leap(outcome, system, y0) or told
     if values and system.functions_given:
         told = system.check_functions_along(outcome.y) or told
     if integrator.trained:
@@ -120,19 +123,21 @@ class Passage(NamedTuple):
     certain: bool
 
 
-def note_poles(outcome: Outcome, integrator: Integrator, problem: Problem, values: ParameterRows | None) -> bool:
+def note_poles(
+    outcome: Outcome, integrator: Integrator, problem: Problem, values: ParameterRows | None
+) -> list[Passage]:
     """End a run where it passed a place at which H is infinite or no number; warn where it may have."""
     poles, width, n = problem.system.definition.poles, 2 * problem.system.ndof, len(outcome.t)
     numbers: Sequence[Any] = ()
     if problem.parameter_values is not None:
         poles, numbers = problem.system.symbols.parametric.poles, [*problem.parameter_values]
     if poles is None or not poles.watched or not n:
-        return False
+        return []
     starts = to_numpy(problem.y0).reshape(-1, width)
     outputs = to_numpy(outcome.y).reshape(n, -1, width)
     with np.errstate(all="ignore"):
         if not poles.may_pass(np.array([starts, outputs[-1]])):
-            return False
+            return []
         every = slice(n - 1, None, -max(1, -(-n // LOOKED_AT), n * starts.size // LOOKED_AT_TOGETHER))  # the last too
         y = np.concatenate([starts[None], outputs[every][::-1]])
         t = np.concatenate([[problem.t0], outcome.t[every][::-1]])
@@ -141,9 +146,9 @@ def note_poles(outcome: Outcome, integrator: Integrator, problem: Problem, value
             if looked is not None and (exact := poles.exact) is not poles:
                 looked = _look(problem.system, exact.look(y, t[:, None])) if exact and exact.watched else None
         except TypeError:  # a function that takes no arrays
-            return False
+            return []
         if looked is None:
-            return False
+            return []
         odd, scale = looked
         held = (np.atleast_1d(np.asarray(outcome.status)) >= 0).reshape(-1)
         rows = np.flatnonzero(odd.any(0) & held)
@@ -176,7 +181,7 @@ def note_poles(outcome: Outcome, integrator: Integrator, problem: Problem, value
             f"{_remedy(integrator, problem)}.",
             RuntimeWarning,
         )
-    return bool(certain)
+    return [*found.values()]
 
 
 def warn_of_cancelling(outcome: Outcome, problem: Problem) -> None:
@@ -364,10 +369,10 @@ def try_steps(integrator: Integrator, system: HamiltonianSystem, t_span: tuple[f
     except Exception:  # which the run itself tells
         return
     if not _failed(outcome):
-        diagnose_piece(outcome, integrator, piece, None)
+        told = diagnose_piece(outcome, integrator, piece, None)
         if _failed(outcome):
             warn(f"`system`: {outcome.message}", RuntimeWarning)
-        else:
+        elif not told:
             warn_of_long_steps(outcome, integrator, piece)
 
 

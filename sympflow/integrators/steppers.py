@@ -231,7 +231,7 @@ def _no_loops_for(y0: Array, system: Any) -> str | None:
         return f"`y0` is on {y0.device}: move it to the CPU, or use backend='array'."
     if transformed(y0):
         return "`y0` is followed by torch.func, forward mode or torch.compile: use backend='array'."
-    if system.layered is None and system.definition.learns(y0):
+    if system.layered is None and system.learns(y0):
         return "`system` has numbers that torch follows: use backend='array'."
     return None
 

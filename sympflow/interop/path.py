@@ -50,7 +50,7 @@ class Path:
         self.driven = system is not None and not system.autonomous
         self.start = t0.to(torch.float64)
         self.t0: Any = 0.0 if not self.driven else self.start if differentiable(t0) else float(t0)
-        learns = system is not None and system.definition.learns(y0)  # True if torch follows numbers of H
+        learns = system is not None and system.learns(y0)  # True if torch follows numbers of H
         self.eager = learns or differentiable(*self.weights(), self.t0)
 
     def __call__(self, s: Tensor) -> Tensor:

@@ -263,7 +263,7 @@ def odeint_adjoint(
         given = tuple(func.parameters())
 
     def make_path(integrator: FixedStep, system: HamiltonianSystem | None, y: Tensor, *more: Any, **named: Any) -> Path:
-        start, learns = float(one_lane(t)[0]), system is not None and system.definition.learns(y)
+        start, learns = float(one_lane(t)[0]), system is not None and system.learns(y)
         field = [system.vector_field(unfollowed(y), start)] if system is not None and learns else []
         parameters = (*(given or ()), *(leaf for slope in field if adjoint_params is None for leaf in leaves(slope)))
         flow = integrator.flow_for(system)  # type: ignore[arg-type]

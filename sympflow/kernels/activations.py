@@ -23,17 +23,9 @@ def _tanh(a: Any) -> tuple[Any, Any]:
     return h, fma(-h, h, 1.0)
 
 
-def _sin(a: Any) -> tuple[Any, Any]:
-    return apply("sin", a), apply("cos", a)
-
-
 def _sigmoid(a: Any) -> tuple[Any, Any]:
     h = _logistic(a)
     return h, h * (1.0 - h)
-
-
-def _softplus(a: Any) -> tuple[Any, Any]:
-    return apply("max", a, 0.0) + apply("log1p", apply("exp", -abs(a))), _logistic(a)
 
 
 def _logcosh(a: Any) -> tuple[Any, Any]:
@@ -49,9 +41,9 @@ def _swish(a: Any) -> tuple[Any, Any]:
 
 SLOPES: dict[str, Callable[[Any], tuple[Any, Any]]] = {
     "tanh": _tanh,
-    "sin": _sin,
+    "sin": lambda a: (apply("sin", a), apply("cos", a)),
     "sigmoid": _sigmoid,
-    "softplus": _softplus,
+    "softplus": lambda a: (apply("max", a, 0.0) + apply("log1p", apply("exp", -abs(a))), _logistic(a)),
     "logcosh": _logcosh,
     "swish": _swish,
 }

@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.compiler import NotCompiled
+from sympflow.compiler import NotCompiled, arrays_only
 from sympflow.compiler.control import INT, Type, Value
 from sympflow.compiler.dual import Dual
 from sympflow.compiler.functions import where
@@ -145,7 +145,8 @@ class KeplerCode(Rollouts):
         x = [values(group[:AXES]) for group in state]
         roots = [sqrt(dot(each, each)) for each in x]
         inverses = [1.0 / r for r in roots]
-        watch = partial(self._watch, room, kick) if self.watches and vector is None else None
+        looks = self.watches and vector is None
+        watch = (lambda near, h: kick + self._met(room, code.any(near), h, kick)) if looks else None
         a, kick = self._accelerations(room, x, c, inverses, kick, watch)
         changes = [kick * y for group in a for y in group]
         if third:
@@ -254,9 +255,6 @@ class KeplerCode(Rollouts):
         program, numbers = self.extra
         given = [room.code.splat(room.code.load(room.data(5), i), LANES) for i in range(len(numbers))]
         return [p - q for p, q in zip(a, program(*h, *given), strict=True)]
-
-    def _watch(self, room: Room, kick: Value, near: Value, h: list[Vectors]) -> Value:
-        return kick + self._met(room, room.code.any(near), h, kick)
 
     def _accelerations(
         self,
@@ -512,9 +510,8 @@ class KeplerLoops:
     def __init__(self, frame: Frame) -> None:
         n, light = len(frame.order), places_of_light(frame)
         if not n or n > MOST_GROUPS * LANES - 1:
-            raise NotCompiled(
-                f"`system` has {n} planets with a mass, and compiled code is for 1 to {MOST_GROUPS * LANES - 1}: use "
-                "backend='array'."
+            raise arrays_only(
+                f"`system` has {n} planets with a mass, and compiled code is for 1 to {MOST_GROUPS * LANES - 1}"
             )
         self.frame, self._light = frame, light
         self._codes: dict[tuple[Form, int, int], KeplerCode] = {}

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from sympflow.compiler import NotCompiled
+from sympflow.compiler import arrays_only
 from sympflow.compiler.arrange import ALWAYS, Arrangement
 from sympflow.compiler.control import INT, Sweep, Type, Value
 from sympflow.compiler.functions import FUNCTIONS, added, is_zero, times
@@ -658,7 +658,9 @@ class _Place:
                     if key[0] == "kept":
                         self.keep((key, axis), x)
                     elif not is_zero(x):
-                        ahead = self._acting(axis, k, self.code.operand(x, self.scene.type))
+                        ahead = self.code.operand(x, self.scene.type)
+                        if self.scene.form.boundary[axis] == "free":  # 0 where a free end leaves a bond out
+                            ahead = self.scene.within(ahead, self.inside(axis, k))
                         change = self.behind(axis, k, key[1], ahead) - ahead
                         total[key[1]] = total[key[1]] + change if key[1] in total else change
         if self.one.name in (OPEN, MIDDLE):
@@ -687,12 +689,6 @@ class _Place:
             return total.get(key[1], 0.0)
         found = self.scene.values.get(key)
         return found if found is not None else self.get(("array", key[1]) if key[0] == "number" else key)
-
-    def _acting(self, axis: int, k: int, x: Value) -> Value:
-        """The effect of a bond, 0 where a free end leaves it out."""
-        if self.scene.form.boundary[axis] != "free":
-            return x
-        return self.scene.within(x, self.inside(axis, k))
 
     def at_wall(self, key: Key, x: Value) -> Value:
         """Velocities, 0 beyond walls."""
@@ -913,9 +909,7 @@ class LatticeCode(SharedRollouts):
         self, lattice: LatticeHamiltonian, damped: bool, level: int, compensated: bool, monomials: Monomials = ()
     ) -> None:
         if level == POLYNOMIAL:
-            raise NotCompiled(
-                "`scheme` has polynomials, which are of systems by their coordinates one by one: use backend='array'."
-            )
+            raise arrays_only("`scheme` has polynomials, which are of systems by their coordinates one by one")
         super().__init__(2 * lattice.ndof * (1 + compensated), 2 * lattice.ndof)
         self._given = lattice, damped, level, compensated
         self._order, width = arrangement(lattice)
@@ -927,7 +921,7 @@ class LatticeCode(SharedRollouts):
         self._stages = _stages(Form.of(lattice, self._order, level, compensated, damped, width, even))
         self._functions, self._lock = self._stages.functions, self._stages.lock
         self.memory = partial(LatticeInMemory, self._stages)
-        self.work, self.terms = lattice.ndof, 1 + level
+        self.work, self.terms, self._slabs = lattice.ndof, 1 + level, dict[int, Slabs]()
 
     @cached_property
     def size(self) -> int:
@@ -935,10 +929,6 @@ class LatticeCode(SharedRollouts):
 
     def stage(self, room: Any, numbers: Numbers, kind: Value, step: Value) -> Any:
         self._stages.stage(room, numbers, kind)
-
-    @cached_property
-    def _slabs(self) -> dict[int, Slabs]:
-        return {}
 
     def members(self, meeting: np.ndarray, stop: np.ndarray, threads: int, block: int) -> Callable[[int], Member]:
         slabs = self._slabs.get(threads)

@@ -14,7 +14,8 @@ Points are the lanes of registers, all else is loops over memory.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
@@ -281,10 +282,6 @@ class _Sweeps:
         self.add_moved(A, sign, rows["H"].part(j * d))
 
 
-def _values(x: Any) -> Rows:
-    return x.values if isinstance(x, DualRows) else x
-
-
 def _flat(x: Any) -> list[Value]:
     return [x.value, x.rate] if isinstance(x, Dual) else [x]
 
@@ -328,12 +325,11 @@ class _Points:
         """The numbers of a row of an array (…, N) at the points from `begin` on."""
         return self.code.load(place, i * self.n_points + begin, REGISTER)
 
-    def blocks(self) -> Any:
-        return self.code.over(self.last - self.first)
-
-    def begin(self, block: Value) -> Value:
-        """The first point of a block: the last one ends with the last point."""
-        return self.code.apply("min", ((self.first + block) * LANES, self.n_points - LANES))
+    @contextmanager
+    def blocks(self) -> Iterator[Value]:
+        """The first point of each block: the last one ends with the last point."""
+        with self.code.over(self.last - self.first) as block:
+            yield self.code.apply("min", ((self.first + block) * LANES, self.n_points - LANES))
 
     def layer(self, i: Value) -> tuple[Value, Value, Value]:
         """Its weights, whether it is a kick, and its sign."""
@@ -341,10 +337,6 @@ class _Points:
         kick = code.apply("eq", (code.load(self.kicks, i, INT), 1))
         sign = code.select(kick, code.constant(-1.0), code.constant(1.0))
         return code.at(self.theta, i * self.sizes.size), kick, sign
-
-    def sides(self) -> Any:
-        """The columns t and 0."""
-        return self.code.over(2)
 
     def share(self, k: Value) -> Value:
         """The sign of a column."""
@@ -368,7 +360,7 @@ class _Points:
             with code.over(sizes.state) as m:
                 after[m] = before[m]
             x, target = code.select(kick, 0 * i, 0 * i + inputs), code.select(kick, 0 * i + inputs, 0 * i)
-            with self.sides() as k:
+            with code.over(2) as k:  # the columns t and 0
                 sweeps, _, _ = self.swept(theta, before, x, k, t)
                 end = after.part(target)
                 moved = DualRows(end, end.part(2 * inputs)) if self.velocity else end
@@ -379,8 +371,7 @@ class _Points:
         """Rows (2d or 4d, N) of ψ̄_t(x) and d/dt ψ̄_t(x)."""
         code, d, inputs = self.code, self.sizes.ndof, self.sizes.inputs
         (out,) = self.more
-        with self.blocks() as block:
-            begin = self.begin(block)
+        with self.blocks() as begin:
             self.forward(begin)
             end = self.states.part(self.n_layers * self.sizes.state)
             for part in range(4 if self.velocity else 2):
@@ -393,10 +384,9 @@ class _Points:
         by_state, by_velocity, units, places, J, by_start = self.more
         n_own, starts = self.flags
         rows = self.sweeps(code, self.theta, self.work).rows
-        G, H, P, M = rows["G"], rows["H"], _values(rows["P"]), _values(rows["M"])
+        G, H, (P, M) = rows["G"], rows["H"], (x.values if self.velocity else x for x in (rows["P"], rows["M"]))
         zero = code.constant(0.0, REGISTER)
-        with self.blocks() as block:
-            begin = self.begin(block)
+        with self.blocks() as begin:
             t = self.forward(begin)
             with code.over(2 * d) as row:
                 with code.over(2 * d) as m:
@@ -413,7 +403,7 @@ class _Points:
                     G[m] = zero
                 with code.over(d * d) as m:
                     H[m] = zero
-                with self.sides() as k:
+                with code.over(2) as k:  # the columns t and 0
                     sweeps, coordinates, times = self.swept(theta, before, x, k, t)
                     with code.over(d) as j:
                         sweeps.add_sensitivities(coordinates, times, code.splat(self.share(k), LANES), j)

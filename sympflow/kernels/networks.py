@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.compiler import NotCompiled
+from sympflow.compiler import NotCompiled, arrays_only
 from sympflow.compiler.control import DOUBLE, INT, POINTER, Type, Value
 from sympflow.compiler.functions import fma
 from sympflow.compiler.program import traced
@@ -65,10 +65,9 @@ class MLPFlowKernel(Kernel):
         depths, activations = {len(layer.biases) for layer in layers}, {layer.activation for layer in layers}
         slopes = layers[0].slopes
         if len(depths) > 1 or len(activations) > 1 or not (activations <= set(SLOPES) or slopes is not None):
-            raise NotCompiled(
-                "`flow` must have potentials of one depth with one activation out of "
-                f"{', '.join(SLOPES)}, or one that was registered with `compiled`, to be compiled: use "
-                "backend='array'."
+            raise arrays_only(
+                f"`flow` must have potentials of one depth with one activation out of {', '.join(SLOPES)}, or one "
+                "that was registered with `compiled`, to be compiled"
             )
         self._given = ndof, layers
         self._rollouts = _NetworkRollouts(ndof, layers)

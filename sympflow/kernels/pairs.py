@@ -8,11 +8,10 @@ own. Each pair is met once: its force is added to one body and taken from the ot
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import sympy as sp
@@ -33,9 +32,7 @@ from sympflow.kernels.teams import Member, SharedMemory, SharedRollouts, meet
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL
 
 if TYPE_CHECKING:
-    from sympflow.hamiltonian.local import LocalHamiltonian
     from sympflow.hamiltonian.monomials import Monomials
-    from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 
 __all__ = ["PairCode", "PairForces", "few"]
 
@@ -129,52 +126,23 @@ def with_parts(total: Any, parts: Sequence[tuple[Any, Sequence[Any]]], axis: int
 # a few bodies: their pairs written out ------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
 class FewSymbols:
     """A few bodies in the place of a symbolic Hamiltonian, whose parameters are all that a pair depends on."""
 
-    local: PairsHamiltonian
-    T = None
-    samples: ClassVar[Mapping[str, Any]] = {}
+    T, samples = None, dict[str, Any]()
 
-    @cached_property
-    def numbers(self) -> dict[str, float]:
-        """The values of the parameters, by their names."""
-        local, named = self.local, {}
-        for c, value in zip(local.c, local.constants, strict=True):
-            named[c.name] = value
+    def __init__(self, local: PairsHamiltonian) -> None:
+        named = {c.name: value for c, value in zip(local.c, local.constants, strict=True)}
         named["softening"] = local.softening**2
         for k, side in enumerate(() if local.box is None else local.box.tolist()):
             named |= {f"box_{k}": side, f"over_box_{k}": 1 / side}
-        for i, mass in enumerate(local.masses.tolist()):
-            named[f"w_{i}"] = 1 / mass
+        named |= {f"w_{i}": 1 / mass for i, mass in enumerate(local.masses.tolist())}
         for i, column in enumerate(local.columns):
             named |= {f"column_{i}_{k}": x for k, x in enumerate(column.tolist())}
-        return named
-
-    @property
-    def ndof(self) -> int:
-        return self.local.ndof
-
-    @property
-    def parametric(self) -> FewSymbols:
-        return self
-
-    @property
-    def values(self) -> tuple[float, ...]:
-        return tuple(self.numbers.values())
-
-    @property
-    def parameters(self) -> tuple[sp.Symbol, ...]:
-        return tuple(map(sp.Symbol, self.numbers))
-
-    @property
-    def q(self) -> tuple[sp.Symbol, ...]:
-        return tuple(sp.Symbol(f"q{i + 1}") for i in range(self.ndof))
-
-    @property
-    def p(self) -> tuple[sp.Symbol, ...]:
-        return tuple(sp.Symbol(f"p{i + 1}") for i in range(self.ndof))
+        self.local, self.ndof, self.parametric = local, local.ndof, self
+        self.values, self.parameters = tuple(named.values()), tuple(map(sp.Symbol, named))
+        self.q, self.p = (tuple(sp.Symbol(f"{x}{i + 1}") for i in range(self.ndof)) for x in "qp")
+        self.inverse_mass = sp.diag(*(sp.Symbol(f"w_{i // local.dim}") for i in range(self.ndof)))
 
     @cached_property
     def V(self) -> sp.Expr:
@@ -183,18 +151,13 @@ class FewSymbols:
         box = [number(f"box_{k}") for k in range(0 if local.box is None else local.dim)]
         return local.written_potential(self.q, number("softening"), columns, {c: number(c.name) for c in local.c}, box)
 
-    @cached_property
-    def inverse_mass(self) -> sp.Matrix:
-        return sp.diag(*(sp.Symbol(f"w_{i // self.local.dim}") for i in range(self.ndof)))
 
-
-def few(local: LocalHamiltonian) -> tuple[Callable[..., Splitting] | None, tuple[float, ...]]:
+def few(local: PairsHamiltonian) -> tuple[Callable[..., Splitting] | None, tuple[float, ...]]:
     """The splitting of a few bodies, None of more, and the values that it reads."""
-    assert isinstance(local, PairsHamiltonian)
     if not local.is_few:
         return None, ()
-    symbols = FewSymbols(local)
-    return partial(FewSplitting, cast("SymbolicHamiltonian", symbols)), symbols.values
+    symbols: Any = FewSymbols(local)
+    return partial(FewSplitting, symbols), symbols.values
 
 
 class FewSplitting(Splitting):
@@ -202,9 +165,11 @@ class FewSplitting(Splitting):
 
     @property
     def key(self) -> tuple[Any, ...]:
-        local = cast("FewSymbols", self.symbols).local
+        local: Any = self.symbols.local  # type: ignore[union-attr]
         pair = local.V, local.first, local.c, local.cutoff is None, local.box is None
         return *pair, local.n_bodies, local.dim, self.level, self.compensated, self.friction
+
+    polynomial = False
 
     def kinds(self) -> Sequence[Stage | WithinRange]:
         _check_level(self.level)
@@ -217,9 +182,10 @@ class FewSplitting(Splitting):
 class FewShape(Shape):
     """A stage of a few bodies: both of a pair share its square root, its division and all else."""
 
-    @cached_property
+    @property
     def _local(self) -> PairsHamiltonian:
-        return cast("FewSymbols", self.symbols).local
+        local: PairsHamiltonian = self.symbols.local  # type: ignore[union-attr]
+        return local
 
     def _kicked(self) -> list[Any]:
         return self._moved([self.made.node(p) for p in self.p])

@@ -18,13 +18,11 @@ from sympflow.compiler.control import BOOL, INT, POINTER, Code, Module, Rows, Ty
 from sympflow.compiler.machine import compiled, host
 
 __all__ = [
-    "ColumnStage",
     "Lanes",
     "Memory",
     "Numbers",
     "Room",
     "Values",
-    "assign",
     "begun",
     "finished",
     "groups",
@@ -32,7 +30,6 @@ __all__ = [
     "reverse_function",
     "run_function",
     "step_function",
-    "there",
 ]
 
 FAST_MEMORY = 16_384  # bytes of the states of a chunk after the other, and of their ends

@@ -11,7 +11,7 @@ from weakref import ref
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.compiler import NotCompiled
+from sympflow.compiler import NotCompiled, arrays_only
 from sympflow.hamiltonian.formulas import TracedDriving, TracedHamiltonian
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.system import HamiltonianSystem
@@ -23,7 +23,6 @@ from sympflow.lazy import kept
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT, Scheme
 
 if TYPE_CHECKING:
-    from sympflow.hamiltonian.friction import Friction
     from sympflow.kernels.approximations import Ranges
     from sympflow.kernels.reverse import Recorded
     from sympflow.kernels.rollouts import SplittingRollouts
@@ -61,7 +60,6 @@ class SplittingLoops:
         self._driving: Driving | TracedDriving | None = None
         self._written: Callable[..., Splitting] | None = None
         self._compile: Callable[..., SplittingRollouts]
-        self._longs: dict[int, bool] = {}
         self._damped_numbers: tuple[Any, np.ndarray] = None, np.empty(0)  # of the latest steps that are all alike
         self.tensors: Sequence[Any] = ()
         self.abreast = 1.0
@@ -80,9 +78,7 @@ class SplittingLoops:
 
                 self._driving = driven_form(symbols if self._large else symbols.parametric)
                 if self._large and self._driving.means:
-                    raise NotCompiled(
-                        "`system` has many terms and a kinetic energy that depends on t: use backend='array'."
-                    )
+                    raise arrays_only("`system` has many terms and a kinetic energy that depends on t")
                 self._driving.check()
                 self._form = self._driving.form
                 self.values, self.traced = self._form.values, True
@@ -115,10 +111,7 @@ class SplittingLoops:
             self._compile = partial(function_code, system.ndof, *given, ndim)
         elif (local := cast(Any, system.local)) is not None:
             if system.damping is not None and system.damping.ndim:
-                raise NotCompiled(
-                    f"`system` {system.name!r} has friction, and its loops take one rate for all momenta: use "
-                    "backend='array'."
-                )
+                raise arrays_only(f"`system` {system.name!r} has friction, and its loops take one rate for all momenta")
             if local.arrays_only:
                 raise NotCompiled(f"`system` has {local.arrays_only}, whose kicks are array operations: use 'array'.")
             if local.loops == "pairs":
@@ -134,9 +127,7 @@ class SplittingLoops:
             self.traced = self._written is not None
         elif system.layered is not None:
             if system.friction:
-                raise NotCompiled(
-                    f"`system` {system.name!r} has friction, and weights that torch follows: use backend='array'."
-                )
+                raise arrays_only(f"`system` {system.name!r} has friction, and weights that torch follows")
             self._has_force_gradient, self.tensors = False, system.layered.tensors
             self.work = system.layered.n_weights
             from sympflow.kernels.layered_splittings import LayeredCode
@@ -173,41 +164,38 @@ class SplittingLoops:
     ) -> SplittingRollouts:
         """The compiled functions for kicks of a level, `varied` with own values, in `ranges` by polynomials."""
         variant = (level, compensated, monomials, varied, ranges)
-        if variant not in self._variants:
-            if level in (FORCE_GRADIENT, CURVATURE) and not self._has_force_gradient:
-                raise NotCompiled(
-                    "`scheme` has force gradients, which need a kinetic energy quadratic in p and, for a system of "
-                    "Numba functions, `hessian_vector`: take a scheme without them, for instance 'kahan_li8'."
-                )
-            if level > FORCE_GRADIENT and not self._has_curvature:
-                what = "curvature terms" if level == CURVATURE else "polynomials"
-                raise NotCompiled(f"`scheme` has {what}, which need a symbolic system: take one without them.")
-            self._variants[variant] = self._made(*variant)
-        return self._variants[variant]
-
-    def _made(
-        self, level: int, compensated: bool, monomials: Monomials, varied: bool, ranges: Ranges | None
-    ) -> SplittingRollouts:
+        if variant in self._variants:
+            return self._variants[variant]
+        if level in (FORCE_GRADIENT, CURVATURE) and not self._has_force_gradient:
+            raise NotCompiled(
+                "`scheme` has force gradients, which need a kinetic energy quadratic in p and, for a system of Numba "
+                "functions, `hessian_vector`: take a scheme without them, for instance 'kahan_li8'."
+            )
+        if level > FORCE_GRADIENT and not self._has_curvature:
+            what = "curvature terms" if level == CURVATURE else "polynomials"
+            raise NotCompiled(f"`scheme` has {what}, which need a symbolic system: take one without them.")
+        made: SplittingRollouts
         if not self.traced:
-            return self._compile(level, compensated, monomials)
-        if not varied and self._long(level):
+            made = self._compile(level, compensated, monomials)
+        elif not varied and self._long(level):
             from sympflow.kernels.array_splittings import term_code
 
-            return term_code(self.splitting(level, monomials, compensated, parametric=False))
-        from sympflow.kernels.splittings import SplittingCode, shared
+            made = term_code(self.splitting(level, monomials, compensated, parametric=False))
+        else:
+            from sympflow.kernels.splittings import SplittingCode, shared
 
-        splitting = self.splitting(level, monomials, compensated, ranges or ())
-        return shared(splitting.key, lambda: SplittingCode(splitting))
+            splitting = self.splitting(level, monomials, compensated, ranges or ())
+            made = shared(splitting.key, lambda: SplittingCode(splitting))
+        self._variants[variant] = made
+        return made
 
     def _long(self, level: int) -> bool:
         """True of stages that are loops over the terms of H."""
         if not self._large or not self.traced:
             return False
-        if level not in self._longs:
-            from sympflow.kernels.terms import is_long
+        from sympflow.kernels.terms import is_long
 
-            self._longs[level] = is_long(self._form, level)
-        return self._longs[level]
+        return is_long(self._form, level)
 
     def splitting(
         self,
@@ -248,12 +236,7 @@ class SplittingLoops:
         return position_ranges(system.symbols, system.domain)
 
     def rows(
-        self,
-        table: StageTable,
-        h: float = 1.0,
-        t0: float = 0.0,
-        varied: bool = False,
-        ranges: Ranges | None = None,
+        self, table: StageTable, h: float = 1.0, t0: float = 0.0, varied: bool = False, ranges: Ranges | None = None
     ) -> np.ndarray:
         """The numbers of a table that the loops read, with values, maps of friction, the times of a driven system."""
         if self.friction:
@@ -405,6 +388,4 @@ class SplittingKernel(Kernel):
         return np.concatenate([y, values], axis=1, dtype=np.float64)
 
 
-@lru_cache(maxsize=256)
-def _damped(table: StageTable, friction: Friction) -> StageTable:
-    return table.damped(friction)
+_damped = lru_cache(maxsize=256)(StageTable.damped)

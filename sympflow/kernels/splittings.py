@@ -15,7 +15,7 @@ import numpy as np
 
 from sympflow.compiler.arrange import Arrangement
 from sympflow.compiler.control import Type, Value, Variable
-from sympflow.compiler.functions import FUNCTIONS, added, dot, times
+from sympflow.compiler.functions import FUNCTIONS, added, dot, is_zero, times
 from sympflow.compiler.program import Program, Traced, adjoint, derivatives, gradient, traced
 from sympflow.hamiltonian.formulas import evaluator
 from sympflow.hamiltonian.monomials import Monomials
@@ -236,15 +236,20 @@ class Shape:
         if M is None:
             moves = self._velocity(momenta, self.number["a"])
             return [made.written(q + x) for q, x in zip(self.q, moves, strict=True)], momenta
-        positions = [made.node(q) for q in self.q]
+        rows = [[M[i, j] for j in range(d)] for i in range(d)]
+        entries = [[times(self.number["a"], self._of_parameters(x)) if x != 0 else 0.0 for x in row] for row in rows]
+        return self._displaced([[made.written(made.number(x)) for x in row] for row in entries], momenta), momenta
+
+    def _displaced(self, factors: Sequence[Sequence[Any]], momenta: Sequence[Any]) -> list[Any]:
+        """q + A p, numbers of the body for each."""
+        made, positions = self.made, [self.made.node(q) for q in self.q]
         self.plain = [*positions]
-        for i in range(d):
-            for j in range(d):
-                if M[i, j] != 0:
-                    factor = made.written(made.number(times(self.number["a"], self._of_parameters(M[i, j]))))
-                    positions[i] = made.moved(positions[i], factor, momenta[j])
-                    self.plain[i] = made.operation("fma", factor, momenta[j], self.plain[i])
-        return positions, momenta
+        for i, row in enumerate(factors):
+            for factor, p in zip(row, momenta, strict=True):
+                if not is_zero(factor):
+                    positions[i] = made.moved(positions[i], factor, p)
+                    self.plain[i] = made.operation("fma", factor, p, self.plain[i])
+        return positions
 
     def _damped(self, name: str, momenta: Sequence[Any]) -> list[Any]:
         """One of the two linear maps of a drift with friction."""
@@ -570,18 +575,13 @@ class SplittingCode(SplittingRollouts):
         if self.timed:
             return np.stack([np.broadcast_to(row, (len(kinds), *shape)) for row in table], axis=1)
         entries = np.zeros((len(kinds), self.size, *shape))
-        for k, columns in self._columns_of_kinds(kinds):
+        for k in range(len(self._kinds)):
+            columns = slice(None) if len(self._kinds) == 1 else kinds == k
             with np.errstate(all="ignore"):
                 rows = self._kinds[k].table(*(row[columns] for row in table))
             for i, row in enumerate(rows):
                 entries[columns, i] = row
         return entries
-
-    def _columns_of_kinds(self, kinds: np.ndarray) -> list[tuple[int, Any]]:
-        """The kinds with their columns."""
-        if len(self._kinds) == 1:
-            return [(0, slice(None))]
-        return [(k, kinds == k) for k in range(len(self._kinds))]
 
     def own_entries(self, table: Any, values: np.ndarray) -> Columns:
         """The numbers of the columns of trajectories with their own values of the parameters."""

@@ -16,16 +16,7 @@ if TYPE_CHECKING:
     from sympflow.hamiltonian.friction import Friction
     from sympflow.hamiltonian.system import HamiltonianSystem
 
-__all__ = [
-    "Kick",
-    "StageTable",
-    "check_damping",
-    "kicks_of",
-    "run_table",
-    "single_table",
-    "step_table",
-    "with_last_stage",
-]
+__all__ = ["StageTable", "check_damping", "kicks_of", "run_table", "single_table", "step_table", "with_last_stage"]
 
 
 @dataclass(frozen=True, eq=False)

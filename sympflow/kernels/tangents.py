@@ -16,7 +16,7 @@ import numpy as np
 from sympflow.compiler import NotCompiled
 from sympflow.compiler.arrange import Arranged
 from sympflow.compiler.control import INT, Value
-from sympflow.compiler.functions import dot, is_zero, summed
+from sympflow.compiler.functions import dot, summed
 from sympflow.compiler.program import Program, derivatives, gradient, traced
 from sympflow.hamiltonian.formulas import evaluator
 from sympflow.hamiltonian.monomials import Monomials
@@ -67,7 +67,7 @@ class Linearised(Shape):
         found = self._by_kick(self.splitting.kick(self.terms, slopes=True))
         momenta = [made.written(x + y) for x, y in zip(self.p, found[:d], strict=True)]
         bends = [made.written(made.number(x)) for x in found[d:]]
-        after = [made.letter(x) for x in momenta]
+        kicked, after = momenta, [made.letter(x) for x in momenta]
         ends: list[Any] = []
         if self.splitting.friction is not None:
             mean, decay = map(self._friction, ("mean", "decay"))
@@ -84,17 +84,8 @@ class Linearised(Shape):
         if symbols.inverse_mass is None:
             positions = [made.written(x + y) for x, y in zip(q, moves, strict=True)]
         else:
-            positions = self._moved_by(q, slants, after)
+            positions = self._displaced([slants[d * i :][:d] for i in range(d)], kicked)
         return made.finish([*positions, *momenta, *bends, *slants, *ends])
-
-    def _moved_by(self, q: Sequence[Any], slants: Sequence[Any], p: Sequence[Any]) -> list[Any]:
-        """q + ∇²T p, a number of the body for each."""
-        made, d, positions = self.made, self.d, [self.made.node(x) for x in q]
-        for i in range(d):
-            for j in range(d):
-                if not is_zero(slants[d * i + j]):
-                    positions[i] = made.moved(positions[i], slants[d * i + j], made.written(p[j]))
-        return positions
 
     def _drift(self) -> Program:
         """∇T and ∇²T."""
@@ -119,14 +110,10 @@ def _vector_moved(
     """A vector (q, p) after a stage, of the derivatives that its program gives after the state."""
     n = d * (d + 1) // 2
     bend, slant, end = derivatives[:n], derivatives[n : n + d * d], derivatives[n + d * d :]
-    p = [summed(p[i], [bend[_place(i, j)] for j in range(d)], q) for i in range(d)]
+    rows = [[bend[max(i, j) * (max(i, j) + 1) // 2 + min(i, j)] for j in range(d)] for i in range(d)]  # symmetric
+    p = [summed(x, row, q) for x, row in zip(p, rows, strict=True)]
     q = [summed(q[i], slant[d * i : d * (i + 1)], p) for i in range(d)]
     return q, [summed(0.0, end[d * i : d * (i + 1)], p) for i in range(d)] if end else p
-
-
-def _place(i: int, j: int) -> int:
-    """The place of an entry of a symmetric matrix, whose rows end at the diagonal."""
-    return max(i, j) * (max(i, j) + 1) // 2 + min(i, j)
 
 
 class TangentCode(SplittingCode):

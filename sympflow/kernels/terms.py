@@ -19,6 +19,7 @@ from sympflow.compiler.functions import is_zero
 from sympflow.compiler.program import Program, gradient, tangent, traced
 from sympflow.hamiltonian.formulas import evaluator
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
+from sympflow.lazy import kept
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT
 
 __all__ = ["Family", "Terms", "families", "is_large", "is_long", "written_out"]
@@ -35,6 +36,7 @@ def is_large(symbols: SymbolicHamiltonian) -> bool:
     return symbols.ndof > MOST_IN_REGISTERS or written_out(symbols.H, symbols.q + symbols.p) > MOST_WRITTEN_OUT
 
 
+@kept
 def is_long(symbols: SymbolicHamiltonian, level: int) -> bool:
     """True where kicks of a level have more operations than are written out, common subexpressions counted once."""
     known, operations, variables, terms = set(symbols.q), set(), 0, sp.Add.make_args(symbols.V)
@@ -148,17 +150,16 @@ def _tree(f: sp.Basic, place: dict[sp.Symbol, int]) -> _Tree:
     if not f.args:
         return _Tree(sp.srepr(f), f, (), ())
     if f.is_Add or f.is_Mul:
-        branches = sorted((_constant(a) or _tree(a, place) for a in f.args), key=lambda tree: tree.text)
+        branches = sorted(
+            (_Tree("c", a, (), (a,)) if a.is_Number and a != -1 else _tree(a, place) for a in f.args),
+            key=lambda tree: tree.text,
+        )
     elif f.is_Pow and f.exp.is_number:
         branches = [_tree(f.base, place), _Tree(sp.srepr(f.exp), f.exp, (), ())]
     else:
         branches = [_tree(a, place) for a in f.args]
     text = f"{type(f).__name__}({','.join(branch.text for branch in branches)})"
     return _Tree(text, f, tuple(branches), tuple(leaf for branch in branches for leaf in branch.leaves))
-
-
-def _constant(f: sp.Basic) -> _Tree | None:
-    return _Tree("c", f, (), (f,)) if f.is_Number and f != -1 else None
 
 
 # derivatives as loops ---------------------------------------------------------------------------------------------

@@ -30,6 +30,7 @@ from sympflow.training.points import (
     shares_missed,
     start_times,
     states,
+    unlabelled,
 )
 from sympflow.training.runs import INTERRUPTED, LABEL_SHARE, OUT_OF_TIME, Advance, Run
 from sympflow.training.session import Deadline, OutOfTime, Session
@@ -64,6 +65,8 @@ class LossRun(Run):
                 labels, unseen = _labels(system, domain, flow.dt, fit, deadline.part(LABEL_SHARE))
             else:
                 labels, unseen = parted(data, fit.seed)
+            if not (fit.residual_weight or fit.matching_weight):
+                self.unfitted = unlabelled((labels if data is None else data)[0], flow.dt)
         common = (fit.matching_times, fit.seed, flow.dtype, flow.device)
         block = 1 if solver.refresh is None else BLOCK
         self.source = PointSource(domain, flow.dt, fit.points, *common, block=block, labels=labels, system=system)

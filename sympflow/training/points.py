@@ -224,14 +224,11 @@ class Labels:
             raise ValueError("`domain` holds no states whose solution exists up to `dt`: shrink one of them.")
         return labels
 
-    def at(self, j: int) -> Labels:
-        """The labels at the j-th time alone."""
-        return Labels(self.t[[j]], self.x, self.y[[j]], self.t0, None if self.work is None else self.work[[j]])
-
-    def first(self, n: int) -> Labels:
-        """The labels of the first n states."""
+    def part(self, n: int | None = None, last: bool = False) -> Labels:
+        """The labels of the first n states, or at the last time alone."""
+        times = slice(-1 if last else None, None)
         t0, work = (None if a is None else a[..., :n] for a in (self.t0, self.work))
-        return Labels(self.t, self.x[:n], self.y[:, :n], t0, work)
+        return Labels(self.t[times], self.x[:n], self.y[times, :n], t0, None if work is None else work[times])
 
     @property
     def times(self) -> np.ndarray | None:

@@ -149,7 +149,7 @@ class Session:
         try:
             return Bar(total, label, start)
         except ImportError:
-            return Lines(total, label)
+            return Silent(total, label)
 
 
 @dataclass(frozen=True)
@@ -198,7 +198,10 @@ def _deadline_at(end: float) -> Deadline:
 
 
 class Silent:
-    """Shows nothing."""
+    """Shows nothing; or of so many a line for each validation, where rich is not installed."""
+
+    def __init__(self, total: int = 0, label: str = "") -> None:
+        self.total, self.label = total, label
 
     def __enter__(self) -> Silent:
         return self
@@ -210,17 +213,8 @@ class Silent:
         pass
 
     def tries(self, done: int, what: str) -> None:
-        pass
-
-
-class Lines(Silent):
-    """One line for each validation: the fallback where rich is not installed."""
-
-    def __init__(self, total: int, label: str) -> None:
-        self.total, self.label = total, label
-
-    def tries(self, done: int, what: str) -> None:
-        print(f"{self.label} {done}/{self.total}  {what}", file=sys.stderr, flush=True)
+        if self.total:
+            print(f"{self.label} {done}/{self.total}  {what}", file=sys.stderr, flush=True)
 
 
 class Bar(Silent):

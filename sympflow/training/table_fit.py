@@ -36,6 +36,7 @@ from sympflow.training.points import (
     states,
     step_errors,
     stream_seed,
+    unlabelled,
 )
 from sympflow.training.runs import LABEL_SHARE, SearchRun, descended
 from sympflow.training.session import Deadline, Session
@@ -84,6 +85,8 @@ class TableRun(SearchRun):
         self.given = table.parameters()
         fractions = FRACTIONAL_TIMES
         data: Any = options.data
+        if data is not None and options.losses == "labels":
+            self.unfitted = unlabelled(data[0], flow.dt)
         self.step = step = TableStep(system, flow.sequence, flow.tables.level, flow.monomials, compiled=True)
         unit = np.array(scaling.x)
         if options.residual_weight or options.matching_weight or data is not None:
@@ -105,9 +108,9 @@ class TableRun(SearchRun):
             if (deadline.session.passed - began) / len(t) * fractions > HELD_OUT_SHARE * deadline.left:
                 fractions = min(fractions, len(t))
             slope = energy_slope(system, labels, options.energy_weight)
-            self._fit_frozen(labels.at(-1), slope)
+            self._fit_frozen(labels.part(last=True), slope)
             weight = np.where(t < t[-1], 1.0, options.frozen_weight)
-            labels = labels.first(fewer := max(FITTED_POINTS, enough // 2))
+            labels = labels.part(fewer := max(FITTED_POINTS, enough // 2))
             slope = None if slope is None else slope[:, :fewer]
             parts.append((options.label_weight, TableFit(step, labels, *table.polynomial(t), unit, weight, slope)))
         elif options.label_weight and data is not None:

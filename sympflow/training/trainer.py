@@ -29,7 +29,7 @@ from sympflow.training.fits import ClockedFit, Fit, GaussNewton, KeplerFit, Loss
 from sympflow.training.lattice_fit import LatticeSubsystem, by_subsystem, check_runs, runs_of
 from sympflow.training.network_fit import LossRun
 from sympflow.training.planet_fit import can_train, train_planets
-from sympflow.training.points import Stream, handed_in, start_times, unlabelled, warn_of_another_system
+from sympflow.training.points import Stream, handed_in, start_times, warn_of_another_system
 from sympflow.training.runs import Run, Unstarted
 from sympflow.training.session import Deadline, OutOfTime, Path, Session
 from sympflow.training.split_fit import SplitRun
@@ -190,7 +190,6 @@ def fit_flow(
             warn_of_domain(system, domain)
         flow = _with_defaults(system, domain, start).flow(system)
     kind = _checked_kind(system, flow, fit)
-    primed = isinstance(fit, PrimedFit)
     check_for_flows(system, takes_friction=kind == "primed", takes_driving=kind in DRIVEN)
     if isinstance(fit, ClockedFit):
         return train_clock(system, fit, domain)
@@ -203,7 +202,7 @@ def fit_flow(
             runs = None if fit.runs is None else partial(runs_of, few, fit.runs, fit.seed)
             fitted = _fitted(few.system, small, kind, replace(fit, runs=None), solver, few.domain, session, runs)
             return few.whole(fitted)
-    if not (primed or isinstance(fit, fits.SplitFit) or session.pool.alone):
+    if not (isinstance(fit, PrimedFit | fits.SplitFit) or session.pool.alone):
         raise TypeError(
             "`workers` share the starts of a search by 'gauss-newton' for primed and split flows, and this fit is one "
             "run of steps: leave it out."
@@ -473,27 +472,19 @@ def _run_of(
         flow = copy.deepcopy(flow).bound(system)
         flow.certified = None  # of the numbers as they were
     dt = flow.dt if flow is not None else 1.0 if fit.dt is None else float(fit.dt)
-    labels, scaling = None, None
+    scaling = None
     try:
         if isinstance(fit, fits.SplitFit):
             return SplitRun(flow, system, domain, scaling, fit, solver, deadline)
         if fit.data is not None:
-            labels = handed_in(fit.data, system, dt)
-            warn_of_another_system(labels, system)
-            fit = replace(fit, data=labels)
+            fit = replace(fit, data=handed_in(fit.data, system, dt))
+            warn_of_another_system(fit.data, system)
         scaling = scaling_of(domain, dt, fit.seed)
         if isinstance(fit, PrimedFit):
-            run: Run = TableRun(flow, system, domain, scaling, fit, solver, deadline, tried=tried, made_runs=runs)
-            if labels is not None and run.fit.losses == "labels":
-                run.unfitted = unlabelled(labels[0], dt)
-            return run
+            return TableRun(flow, system, domain, scaling, fit, solver, deadline, tried=tried, made_runs=runs)
         if isinstance(fit, NetworkFit):
             flow = fit.network(system, dt, scaling)
-        run = LossRun(flow.requires_grad_(True), system, domain, scaling, fit, solver, deadline)
-        if not (run.fit.residual_weight or run.fit.matching_weight):
-            made = dt * np.arange(1, fit.label_times + 1) / fit.label_times
-            run.unfitted = unlabelled(made if labels is None else labels[0], dt)
-        return run
+        return LossRun(flow.requires_grad_(True), system, domain, scaling, fit, solver, deadline)
     except OutOfTime as cut:
         flow = flow if tried is None else tried
         return Unstarted(flow, system, domain, scaling, fit, solver, reached=str(cut))

@@ -410,3 +410,64 @@ def test_gradients_where_forces_are_rounding(method):
     J = torch.autograd.functional.jacobian(lambda y: step.step(circle, 0.0, y, 0.05), torch.tensor(circle.y0))
     omega = torch.tensor(np.kron([[0.0, 1.0], [-1.0, 0.0]], np.eye(2)))
     torch.testing.assert_close(J.T @ omega @ J, omega, rtol=0, atol=1e-13)
+
+
+def of_two(q):
+    return torch.cos(q[..., 0] - q[..., 1]) + (q**4).sum(-1) / 4
+
+
+def verlet_by_hand(y, mass, n_steps, dt):
+    q, p = y.chunk(2)
+    force = torch.func.grad(of_two)
+    for _ in range(n_steps):
+        p = p - dt / 2 * force(q)
+        q = q + dt * (p / mass if mass.ndim < 2 else torch.linalg.solve(mass, p))
+        p = p - dt / 2 * force(q)
+    return torch.cat([q, p])
+
+
+@pytest.mark.parametrize("mass", [1.7, [1.7, 0.6], [[1.7, 0.3], [0.3, 0.9]]], ids=["one", "each", "matrix"])
+def test_gradients_flow_to_masses(mass):
+    y0, mass = torch.tensor([0.3, 0.5, -0.2, 0.7], dtype=torch.float64), torch.tensor(mass, dtype=torch.float64)
+    mass.requires_grad_()
+    system = HamiltonianSystem(of_two, ndof=2, mass=mass, y0=y0.numpy())
+    (expected,) = torch.autograd.grad(verlet_by_hand(y0, mass, 10, 0.1).square().sum(), mass)
+    sol = solve(system, "verlet", (0, 1), y0, dt=0.1)
+    assert sol.stats["backend"] == "torch"
+    (found,) = torch.autograd.grad(sol.y[:, -1].square().sum(), mass)
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-13)
+    for method in ("kahan_li8", "srkn11b", "takahashi_imada", "gauss_legendre6", "rk4"):  # of small steps
+        (near,) = torch.autograd.grad(solve(system, method, (0, 1), y0, dt=0.02).y[:, -1].square().sum(), mass)
+        torch.testing.assert_close(near, expected, rtol=0, atol=0.03)
+        small = 1e-5 * torch.ones_like(mass)
+        ends = [
+            solve(HamiltonianSystem(of_two, ndof=2, mass=(mass + sign * small).detach()), method, (0, 1), y0, dt=0.02)
+            for sign in (1, -1)
+        ]
+        slope = (ends[0].y[:, -1].square().sum() - ends[1].y[:, -1].square().sum()) / 2e-5
+        torch.testing.assert_close(near.sum(), slope, rtol=0, atol=1e-8)
+
+
+def test_masses_may_change_between_runs():
+    y0, mass = torch.tensor([0.3, 0.5, -0.2, 0.7], dtype=torch.float64), torch.tensor([1.0, 2.0], dtype=torch.float64)
+    mass.requires_grad_()
+    system = HamiltonianSystem(of_two, ndof=2, mass=mass, y0=y0.numpy(), stiffness_matrix=np.eye(2))
+    for values in ([1.0, 2.0], [0.5, 3.0]):
+        with torch.no_grad():
+            mass.copy_(torch.tensor(values))
+        expected = verlet_by_hand(y0, mass.detach(), 10, 0.1)
+        torch.testing.assert_close(solve(system, "verlet", (0, 1), y0, dt=0.1).y[:, -1], expected, rtol=0, atol=1e-14)
+        sol = solve(system, "verlet", (0, 1), dt=0.1)
+        assert "`mass` requires gradients" in sol.stats["backend"]
+        np.testing.assert_allclose(sol.y[:, -1], expected, rtol=0, atol=1e-14)
+    with pytest.raises(ValueError, match=r"^`mass` requires gradients, .* pass mass\.detach"):
+        solve(system, "linear_srkn6b", (0, 1), y0, dt=0.1)
+
+
+def test_functions_of_tensors_run_in_inference_mode():
+    y0, weight = torch.tensor([0.3, 0.5, -0.2, 0.7], dtype=torch.float64), torch.ones((), requires_grad=True)
+    expected = verlet_by_hand(y0, torch.ones(()), 10, 0.1)
+    for V in (of_two, lambda q: weight * of_two(q)):
+        with torch.inference_mode():
+            found = solve(HamiltonianSystem(V, ndof=2), "verlet", (0, 1), y0, dt=0.1).y[:, -1]
+        np.testing.assert_allclose(found.numpy(), expected.numpy(), rtol=0, atol=1e-14)

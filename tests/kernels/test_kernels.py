@@ -86,10 +86,7 @@ def systems():
         "numba_chain": numba_chain(),
         "full mass matrix": HamiltonianSystem.from_sympy(FULL_MASS_MATRIX, y0=[0.3, -0.2, 0.0, 0.4]),
         "relativistic": HamiltonianSystem.from_sympy(RELATIVISTIC, y0=[0.5, 0.4]),
-        "kepler": HamiltonianSystem.from_sympy(
-            "(p1**2 + p2**2)/2 - 1/sqrt(q1**2 + q2**2)",
-            y0=[1.0, 0.0, 0.0, 0.9],
-        ),
+        "kepler": HamiltonianSystem.from_sympy("(p1**2 + p2**2)/2 - 1/sqrt(q1**2 + q2**2)", y0=[1.0, 0.0, 0.0, 0.9]),
     }
 
 

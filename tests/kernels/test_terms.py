@@ -33,10 +33,7 @@ def chain(kinetic="p{0}**2/2"):
 SYSTEM = chain()
 
 
-SMALL = {
-    "masses": "p1**2/2 + p2**2/3 + p3**2/4 + ",
-    "coupled": "p1**2/2 + p2**2/2 + p3**2/2 + p1*p2/3 + ",
-}
+SMALL = {"masses": "p1**2/2 + p2**2/3 + p3**2/4 + ", "coupled": "p1**2/2 + p2**2/2 + p3**2/2 + p1*p2/3 + "}
 V = "(q1 - q2)**2/2 + (q2 - q3)**2/3 + (q1 - q2)**4/5 + (q2 - q3)**4/6 + cos(q1) + sqrt(2 + q3**2) + 7"
 
 

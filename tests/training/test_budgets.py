@@ -229,9 +229,6 @@ def test_a_domain_whose_squares_overflow_is_refused():
         train(PENDULUM, 0.1, domain=Box([-1e200, -1e200], [1e200, 1e200]), restarts=1)
 
 
-# memory -------------------------------------------------------------------------------------------------------
-
-
 # primed flows of every H = ½ pᵀM⁻¹p + V(q) --------------------------------------------------------------------
 
 
