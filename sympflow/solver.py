@@ -363,7 +363,7 @@ def _solved(integrator: Integrator, problem: Problem, action: str, rows: Paramet
     integrator.check_library(y_start)
     run: Callable[[Integrator, Problem], tuple[Outcome, Problem]] = _run
     able = problem.store is None and problem.parameter_values is None
-    told, jumps = landings(integrator, between, problem.t0, problem.t1, able, kinks=True)
+    told, jumps = landings(integrator, between, problem.t0, problem.t1, able, kinks=rows is None)
     if told:
         without = "a `store`" if problem.store is not None else "gradients by `params`, and with `t_eval`"
         warn(told if able else f"{told} Without {without}, steps end at jumps.", RuntimeWarning)

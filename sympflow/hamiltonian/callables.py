@@ -164,7 +164,7 @@ class CallableHamiltonian(Definition):
     @cached_property
     def _jumping(self) -> Definition:
         """The form in symbols, whose jumps in t are known, of functions that may jump."""
-        written = self.form.written if self.timed and self.form is not None and self.form.may_jump else None
+        written = self.form.written if self.timed and self.form is not None and self.form.may_bend else None
         return Definition() if written is None else written
 
     @property

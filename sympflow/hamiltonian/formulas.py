@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 MOST_IN_SYMBOLS = 300  # operations
 _JUMPING = {"sign", "floor", "mod", "where", "lt", "le", "eq", "atan2"}
+_BENDING = {"abs", "min", "max", "asin", "acos"}
 _SINGULAR = {"div": 1} | dict.fromkeys((
     "pow", "log", "log1p", "tan", "sqrt", "acos", "asin", "acosh", "atanh", "gamma", "lgamma", "digamma", "ellipk",
     "bose", "csch",
@@ -146,13 +147,13 @@ class TracedHamiltonian:
         return self
 
     @property
-    def may_jump(self) -> bool:
-        """True if some operation jumps."""
-        return any(x.name in _JUMPING for x in self.program.operations)
+    def may_bend(self) -> bool:
+        """True if some operation jumps, or has a kink."""
+        return any(x.name in _JUMPING | _BENDING for x in self.program.operations)
 
     def check_continuous(self, argument: str) -> None:
         """Refuse a function that jumps in q or p."""
-        if not self.may_jump or len(self.program) > MOST_IN_SYMBOLS:
+        if not any(x.name in _JUMPING for x in self.program.operations) or len(self.program) > MOST_IN_SYMBOLS:
             return
         from sympflow.hamiltonian.jumps import check_continuous
         from sympflow.hamiltonian.recorded import NotRecorded, in_symbols

@@ -88,11 +88,12 @@ class _Smooth(sp.Function):
     def _code(self, printer: Any) -> str:
         """The name by which SymPy's printers of code ask."""
         written = type(self).written(sp.Symbol("its_argument", real=True))
-        if "Torch" in type(printer).__name__:
-            written = written.rewrite(sp.exp).rewrite(sp.log)
         return f"({printer._print(written)})".replace("its_argument", f"({printer._print(self.args[0])})")
 
-    _pythoncode = _numpycode = _mpmathcode = _torchcode = _code
+    _pythoncode = _numpycode = _mpmathcode = _code
+
+    def _torchcode(self, printer: Any) -> str:
+        return f"{type(self).__name__}({printer._print(self.args[0])})"
 
 
 class expit(_Smooth):

@@ -9,7 +9,7 @@ import reprlib
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, reduce
+from functools import cached_property, partial, reduce
 from itertools import islice
 from operator import add
 from types import MappingProxyType
@@ -22,6 +22,7 @@ from sympy.printing.codeprinter import PrintMethodNotImplementedError
 
 from sympflow.arguments import check_kept, plain
 from sympflow.arrays import Array, assemble, beside, concatenate, library_name
+from sympflow.compiler.functions import apply
 from sympflow.hamiltonian.definition import Definition
 from sympflow.hamiltonian.driving import (
     DURATION,
@@ -861,6 +862,9 @@ def _modules(library: str, code: list[sp.Expr]) -> list[Any]:
 
     return [
         {
+            **{name: partial(apply, name) for name in ("bose", "softplus", "logcosh")},
+            "triangle": lambda x: x.sin().asin(),
+            "expit": torch.special.expit,
             "tensor_erfc": torch.special.erfc,
             "heaviside": heaviside,
             "max": pairwise(torch.maximum),

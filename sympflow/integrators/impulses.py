@@ -17,6 +17,7 @@ from sympflow.integrators.grid import EPS
 
 Run = Callable[[Integrator, Problem], tuple[Outcome, Problem]]
 MOST_LANDINGS = 20_000  # jumps at which a run is cut; one with more is not, and warns
+MOST_KINKS = 5000
 ASIDE = 64 * EPS
 """Share of the times between which a run goes on from a jump, or ends before it, so that H is that of one side."""
 
@@ -60,7 +61,7 @@ def landings(
     cuts = [(times, False)] if said else []
     if kinks and dt is not None and (integrator.order or 0) > 2:
         bends = system.jump_times(min(t0, t1), max(t0, t1), step, True)
-        if len(_within(bends, t0, dt)):
+        if len(_within(bends, t0, dt)) and len(bends) <= MOST_KINKS:
             cuts.insert(0, (sorted({*bends.tolist(), *times}), True))
     for met, bent in cuts:  # all times are known, of which the first ones may be listed
         if 0 < len(met) <= MOST_LANDINGS and not len(system.jump_times(max(met), max(t0, t1), step, bent)):

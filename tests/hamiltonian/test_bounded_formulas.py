@@ -107,6 +107,14 @@ def test_functions_of_python_are_written_so_too(V, slope):
         assert sol.y[:, 0, -1] == pytest.approx(q - 5e-5 * np.nan_to_num(slope(q)), rel=1e-13)
 
 
+@pytest.mark.parametrize("backend", ["auto", "array"])
+def test_gradients_flow_through_them(backend):
+    y0 = torch.tensor([[5.0, -1.0], [-5.0, 1.0]], dtype=torch.float64, requires_grad=True)
+    system = HamiltonianSystem.from_sympy("p**2/2 - 1/(1 + exp(300*q)) + log(1 + exp(300*q))/3e3")
+    sf.solve(system, "verlet", (0, 2), y0, dt=0.01, backend=backend).y[:, 0, -1].sum().backward()
+    assert y0.grad.numpy() == pytest.approx(np.array([[1.0, 2.0], [1.0, 2.0]]), abs=1e-12)
+
+
 def test_a_force_that_is_no_number_is_told():
     system = HamiltonianSystem.from_sympy("p**2/2 - q**40/(1 + q**40)")
     sol = sf.solve(system, "verlet", (0, 1), [1e9, 0.0], dt=0.1)

@@ -56,6 +56,24 @@ def test_methods_of_high_order_keep_it_at_kinks_in_t(drive):
     np.testing.assert_allclose(sol.y, exact.y, atol=1e-9)
 
 
+@pytest.mark.parametrize(
+    "drive", [lambda s: np.abs(np.sin(s)), lambda s: np.maximum(np.sin(s), 0.2), lambda s: np.arcsin(np.sin(s))]
+)
+def test_kinks_of_functions_are_met(drive):
+    exact = solve_ivp(
+        lambda s, y: [y[1], drive(s) - y[0]], (0, 9), [1, 0], "DOP853", rtol=1e-12, atol=1e-12, max_step=1e-2
+    )
+    system = HamiltonianSystem(
+        potential=lambda s, q: q[..., 0] ** 2 / 2 - q[..., 0] * drive(s), ndof=1, time=True, y0=[1, 0]
+    )
+    np.testing.assert_allclose(solve(system, "kahan_li8", (0, 9), dt=0.05).y[:, -1], exact.y[:, -1], atol=1e-10)
+
+
+def test_a_batch_of_parameters_has_outputs_at_common_times():
+    system = made("p**2/2 + q**2/2 - q*abs(sin(w*t))", time="t", params={"w": 1.0}, y0=[1, 0])
+    assert solve(system, "kahan_li8", (0, 9), params={"w": [1.0, 1.3]}, dt=0.05).y.shape == (2, 2, 181)
+
+
 def test_kinks_of_samples_are_met():
     times = np.linspace(0, 20, 41)
     a = CubicSpline(times, np.sin(times))
