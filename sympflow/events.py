@@ -89,15 +89,11 @@ class EventSearch:
 
     def __init__(self, events: tuple[Event, ...], max_interval: float | None = None) -> None:
         self.events, self.max_interval = events, max_interval
+        self.may_end_run = any(math.isfinite(event.limit) for event in events)
         self.found: list[list[tuple[float, Array]]] = [[] for _ in events]
         self.values: list[float] | None = None
         self.end: tuple[float, Array] | None = None  # the time and state of the terminal event that ended the run
         self.n_dense = 0  # evaluations of the dense output
-
-    @property
-    def may_end_run(self) -> bool:
-        """True if one of the events is terminal."""
-        return any(math.isfinite(event.limit) for event in self.events)
 
     def afresh(self) -> EventSearch:
         """Return a search for the same events that has found none."""

@@ -159,14 +159,12 @@ class Scheme:
             )
         if self.polynomials and (any(self.gradients) or any(self.curvatures)):
             raise ValueError("`polynomials` stand in place of `gradients` and `curvatures`: leave these out.")
+        # made once: tables are looked up by their scheme in every run
+        made = hash((self.name, self.kicks, self.drifts, self.gradients, self.curvatures))
+        object.__setattr__(self, "_hash", made)
 
     def __hash__(self) -> int:
-        return self._hash
-
-    @cached_property
-    def _hash(self) -> int:
-        """Made once: tables are looked up by their scheme in every run."""
-        return hash((self.name, self.kicks, self.drifts, self.gradients, self.curvatures))
+        return vars(self)["_hash"]
 
     @cached_property
     def substeps(self) -> tuple[Substep, ...]:
@@ -529,8 +527,6 @@ def reversed_substeps(substeps: Substeps) -> Substeps:
     kicks, drifts = [(-b, -c) for b, _, c in substeps[::-1]], [-a for _, a, _ in substeps[::-1]]
     return [(b, a, c) for (b, c), a in zip([(0.0, 0.0), *kicks], [*drifts, 0.0], strict=True)]
 
-
-# symplectic correctors ---------------------------------------------------------------------------------------------
 
 CORRECTORS = range(3, 18, 2)
 """The orders in dt to which correctors remove the errors of first order in a small kick."""

@@ -13,6 +13,7 @@ import numpy as np
 
 from sympflow.arguments import check_flag, told, warn
 from sympflow.arrays import Array, concatenate, is_tensor, to_numpy
+from sympflow.hamiltonian.bodies import PairsHamiltonian
 from sympflow.hamiltonian.scales import known_scale, size_of_terms, weights
 from sympflow.integrators.contract import method_text
 from sympflow.integrators.interpolants import Mapped
@@ -38,16 +39,6 @@ LARGE = 2_000_000  # numbers of a solution beyond which its card has no energy e
 LOOKED_AT = 64  # outputs at which the terms of H are looked at
 
 
-class NoOutput:
-    """The dense output of a run that was asked for none: it is false."""
-
-    def __bool__(self) -> bool:
-        return False
-
-    def __call__(self, t: Any) -> Array:
-        raise TypeError("`sol` is for runs with dense output: pass dense_output=True to solve(), or times as `t_eval`.")
-
-
 @dataclass(repr=False)
 class Solution(Answering):
     """The solution of an initial value problem, with SciPy's fields.
@@ -58,9 +49,8 @@ class Solution(Answering):
         Output times.
     y : ndarray or tensor of shape (..., 2d, n)
         States [q, p], time last, as in SciPy.
-    sol : callable
-        Dense output: sol(t) has shape (..., 2d) for a number t, (..., 2d, n) for an array. It is false where none was
-        asked for.
+    sol : callable or None
+        Dense output: sol(t) has shape (..., 2d) for a number t, (..., 2d, n) for an array.
     t_events, y_events : list of ndarray or None
         For each event its times (n,) and states (n, 2d), without gradient (`interop.torchdiffeq.odeint_event` gives
         that); None if no events were asked for.
@@ -111,9 +101,6 @@ class Solution(Answering):
     t_events: list[np.ndarray] | None = None
     y_events: list[np.ndarray] | None = None
     rows: ParameterRows | None = None
-
-    def __post_init__(self) -> None:
-        self.sol = self.sol or NoOutput()
 
     def __getitem__(self, key: Any) -> Any:
         raise TypeError(
@@ -265,7 +252,7 @@ class Solution(Answering):
         ----------
         kinds : sequence of str
             Of "orbit", q₁ against q₂ (q over t of one degree of freedom, a map of all q of many), "phase", q₁ against
-            p₁, and "energy", which is left out where energy is not kept.
+            p₁, of bodies their orbits and x against pₓ/m, and "energy", which is left out where energy is not kept.
         """
         shown = self if self.system.shows_energy is self.system.keeps_energy else self.physical()
         y, kinds = to_numpy(shown.y), (kinds,) if isinstance(kinds, str) else kinds
@@ -273,8 +260,16 @@ class Solution(Answering):
         if self.system.shows_energy:
             with warnings.catch_warnings(action="ignore"):
                 error = energy_change(self).reshape(-1, len(self.t))
+        rates, local, states = None, self.system.local, to_numpy(shown.states)
+        if not self.varied and states.size < LARGE:
+            with np.errstate(all="ignore"):
+                field = shown.system.vector_field(states, np.broadcast_to(self.t, states.shape[:-1]))
+            rates = np.asarray(field).swapaxes(-1, -2).reshape(-1, *y.shape[-2:])
+        masses = local.masses if isinstance(local, PairsHamiltonian) else None
         heading = f"{self.system.title}, {method_text(self.integrator, self.stats.get('dt'))}"
-        return saved(trajectory_figure(self.t, y.reshape(-1, *y.shape[-2:]), error, heading, kinds), path)
+        return saved(
+            trajectory_figure(self.t, y.reshape(-1, *y.shape[-2:]), error, heading, kinds, "", rates, masses), path
+        )
 
     def to_scipy(self) -> OptimizeResult:
         """The `OdeResult` that `scipy.integrate.solve_ivp` would have returned; of a single trajectory.

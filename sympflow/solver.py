@@ -312,7 +312,7 @@ def _shown(
     bar = Progress(progress, abs(t1 - t0), lambda done: f"t = {t0 + sign * done:.6g} of {t1:.6g}")
     try:
         sol = _answered(integrator, replace(problem, progress=bar), action, rows)
-        if sol.success and not bar.complete:
+        if sol.success and bar.done != bar.total:
             bar(bar.total)
     finally:
         bar.end()

@@ -143,7 +143,6 @@ ANSWERED = {
     "an event of y": (lambda: solve(SPRING, y0=[1, 0], events=lambda y: y), TypeError, r"Write g\(t, y\)"),
     "Tsit5": (lambda: sympflow.get("Tsit5"), ValueError, "'dop853'"),
     "symplectic": (lambda: sympflow.get("symplectic"), ValueError, "'srkn11b', or 'kahan_li8'"),
-    "no dense output": (lambda: ran().sol(3), TypeError, "`sol` is for runs with dense output: pass dense_output=True"),
     "sol[0]": (lambda: ran()[0], TypeError, r"`sol` has no item 0: take `sol.t`, `sol.y`"),
     "t, y = sol": (lambda: list(ran()), TypeError, r"as in t, y = sol.t, sol.y"),
     "sol.q1": (lambda: ran().q1, AttributeError, r"'q1': take `q\[..., i, :\]`"),
@@ -186,6 +185,17 @@ ANSWERED = {
     "from_sympy(tspan=)": (lambda: H(SPRING, tspan=1), TypeError, "did you mean `t_span`"),
     "any case": (lambda: systems.Kepler, AttributeError, "Did you mean 'kepler'"),
     "system.train": (lambda: H(SPRING).train, AttributeError, r"take sympflow.train\(system\)"),
+    "y0 of a formula": (
+        lambda: solve(SPRING, y0=[1, 0, 0]),
+        ValueError,
+        r"for 'H = p1\*\*2/2 \+ q1\*\*2/2', \[q, p\] with 1 each",
+    ),
+    "f.pt": (lambda: sympflow.shipped_flows("pendulum")[0].load().save("f.pt"), ValueError, "call it f.safetensors"),
+    "a list of elements": (
+        lambda: HamiltonianSystem.planets([1, 0.1], elements=[{"a": 1}]),
+        ValueError,
+        r"`elements` must give a, .* as in \{'a': \[...\], 'e'",
+    ),
     "scene": (lambda: systems.henon, AttributeError, "Did you mean 'henon_heiles'"),
 }
 
@@ -196,8 +206,9 @@ def test_the_answer_names_the_remedy(call, kind, answer):
         call()
 
 
-def test_a_solution_without_dense_output_has_a_false_one():
-    assert not ran().sol
+def test_a_solution_without_dense_output_has_none_as_in_scipy():
+    assert ran().sol is None
+    assert ran().to_scipy()["sol"] is None
     assert solve(SPRING, "verlet", (0, 1), [1, 0], dt=0.1, dense_output=True).sol
 
 
@@ -214,6 +225,22 @@ def test_a_tolerance_chooses_the_step_of_a_run_that_an_event_ends(end):
     turns.terminal, turns.direction = True, 1
     sol = solve("pendulum", "srkn11b", (0, end), [1.0, 0.0], events=turns, tol=1e-12)
     np.testing.assert_allclose(sol.t_events[0], 2 * ellipk(np.sin(0.5) ** 2), rtol=1e-12)
+
+
+def test_a_flow_of_a_system_without_a_domain_is_trained_around_its_orbit():
+    system = H("p**2/2 + q**2/2 + q**4/4", y0=[1.0, 0.0])
+    flow = sympflow.train(system, restarts=1, steps=5, points=40)
+    sol = solve(system, flow, (0, 50))
+    assert "domain_exit" not in sol.stats
+    assert sympflow.max_energy_error(sol) < 1e-4
+
+
+@pytest.mark.parametrize(
+    ("function", "title"),
+    [(sympflow.lyapunov, "Lyapunov exponent"), (sympflow.sali, "SALI"), (sympflow.gali, "GALI")],
+)
+def test_indicators_are_shown_by_their_names(function, title):
+    assert repr(function("henon-heiles", "verlet", (0, 1))).startswith(f"{title}\n")
 
 
 def test_states_in_the_place_of_times_are_told():

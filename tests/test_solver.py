@@ -140,9 +140,10 @@ def test_a_batch_of_dopri5_with_one_blow_up_goes_on_one_by_one():
 
 @pytest.mark.parametrize("method", ["verlet", "rk45", "dopri5", "rk4", "sympflow"])
 def test_solutions_can_be_pickled(method):
-    sol = solve(HH, method, (0, 2))
+    sol = solve(HH, method, (0, 2), dense_output=True)
     copy = pickle.loads(pickle.dumps(sol))
     np.testing.assert_array_equal(copy.y, sol.y)
+    np.testing.assert_array_equal(copy.sol(0.7), sol.sol(0.7))
     np.testing.assert_array_equal(copy.energy(), sol.energy())
     assert len(repr(sol)) < 1000
 
@@ -168,6 +169,7 @@ def test_a_limit_on_steps_keeps_what_was_computed(method):
     sol = solve(fast, method, (0, 1000), [1.0, 0.0])
     assert (sol.status, sol.stats["n_steps"], len(sol.t)) == (-1, 10_000, 10_001)
     assert re.match(r"After 10,000 steps t = 0\.0\d+ is reached.* `max_steps` is 10,000,000\. Raise it", sol.message)
+    assert sol.message.endswith("terms of H that cancel lose digits, and are to be written otherwise.")
     few = solve(HH, method, (0, 100), max_steps=7, dense_output=True)
     whole = solve(HH, method, (0, 100))
     assert (few.status, few.stats["n_steps"], few.stats["failed_at"]) == (-1, 7, few.t[-1])

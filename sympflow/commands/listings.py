@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from sympflow.commands import completion
-from sympflow.commands.console import Quiet, print_table, reporting
+from sympflow.commands.console import Quiet, out, print_table, reporting
 from sympflow.commands.words import Own, Systems, made, one_scene, parameters, scene_names, shown
 
 if TYPE_CHECKING:
@@ -51,7 +51,11 @@ def flows(ctx: typer.Context, system: Systems = None, own: Own = None, quiet: Qu
         from sympflow.flow.shipped import HEADINGS, shipped_flows
 
         scene = one_scene(system, own).system if system or own else None
-        print_table(HEADINGS, list(shipped_flows(scene).rows()))
+        rows = list(shipped_flows(scene).rows())
+        if not rows and scene is not None:
+            out.print(f"No flow ships for {scene.title}. `sympflow train` makes one.", markup=False)
+            return
+        print_table(HEADINGS, rows)
 
 
 def methods(

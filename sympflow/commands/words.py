@@ -149,6 +149,13 @@ def scenes(words: Sequence[str] | None, own: Sequence[str] | None = None) -> lis
         known = {p for _, factory, _ in parted for p in _defaults(factory)}
         for name in shared:
             if name not in known:
+                if name in ("param", "params", "parameter", "parameters") and "=" in shared[name]:
+                    raise Usage(f"`--{name}` is no option: write --{' '.join(shared[name].split('=', 1))}.")
+                if name in OF_METHODS:
+                    given = f"{name}={shared[name]}"
+                    raise Usage(
+                        f"`--{name}` is an option of some methods: give it behind the name, --method NAME:{given}."
+                    )
                 takes = f"its parameters are {', '.join(sorted(known))}" if known else "it has no parameters"
                 option, by_case = name.replace("_", "-"), {p.lower(): p for p in known}
                 meant = MEANT.get(name.lower()) or by_case.get(name.lower())
@@ -185,8 +192,10 @@ def one_scene(words: Sequence[str] | None, own: Sequence[str] | None = None) -> 
 def interval(scene: Scene, t_start: float | None, t_end: float | None) -> tuple[float, float]:
     """From the start that is asked for, or the scene's, to the end: with the scene, by --t-end, or its own."""
     start, end = scene.system.t_span
-    asked = [at for at in (scene.t_end, t_end, end) if at is not None]
-    return check_t_span((start if t_start is None else t_start, asked[0]))
+    asked = [at for at in (scene.t_end, t_end) if at is not None]
+    if not asked and t_start is not None and (end - t_start) * (end - start) <= 0:
+        raise Usage(f"`--t-start` {t_start:g} is not before the end, {end:g}: give --t-end too.")
+    return check_t_span((start if t_start is None else t_start, asked[0] if asked else end))
 
 
 def _split(words: Sequence[str]) -> tuple[list[str], dict[str, str]]:
@@ -222,6 +231,7 @@ MEANT = {  # options by the names that users try
     **dict.fromkeys(("q0", "p0", "x0", "q", "p", "initial", "ic"), "y0"),
     **dict.fromkeys(("output", "save", "plot", "file", "csv", "o"), "out"),
 }
+OF_METHODS = ("rtol", "atol", "max_step", "first_step", "compensated", "corrector", "splitting", "clock", "flow")
 FORMULA = re.compile(r"\*|[²³]|(?<![A-Za-z])[qp]\d*\s*[-+/^]")  # a word that is H, and not the name of a scene
 
 
@@ -270,7 +280,7 @@ def _parted(word: str) -> tuple[str, Callable[..., HamiltonianSystem], list[str]
         if equals:
             raise Usage(f"`system` {word!r} is not a system: give a parameter as --{key} {value}.")
         if word in available_methods():
-            raise Usage(f"`system` {word!r} is a method: give it as --method {word}.")
+            raise Usage(f"`system` {word!r} is a method: give it as --method {word}, several with commas.")
         files = [str(path) for path in map(Path, (f"{word}.py", f"{word}.toml")) if path.is_file()]
         last = name.rpartition(".")[2].lower()
         close = files or difflib.get_close_matches(last, scene_names(), n=1, cutoff=0.5)

@@ -15,19 +15,8 @@ from typing import Any, NamedTuple
 from sympflow.compiler.numbers import Number
 
 __all__ = [
-    "BOOL",
-    "DOUBLE",
-    "INT",
-    "LOWERED",
-    "POINTER",
-    "Code",
-    "Module",
-    "Rows",
-    "Sweep",
-    "Type",
-    "Value",
-    "Variable",
-]
+    "BOOL", "DOUBLE", "INT", "LOWERED", "POINTER", "Code", "Module", "Rows", "Sweep", "Type", "Value", "Variable",
+]  # fmt: skip
 
 
 class Type(NamedTuple):
@@ -210,13 +199,7 @@ class Code:
     """One function, written line by line; its `arguments` are values."""
 
     def __init__(
-        self,
-        module: Module,
-        name: str,
-        arguments: Sequence[Type],
-        result: Type | None,
-        within: bool = False,
-        rare: bool = True,
+        self, module: Module, name: str, arguments: Sequence[Type], result: Type | None, within: bool, rare: bool
     ) -> None:
         self.module, self.name, self.result = module, name, result
         self._kind, self._traits = ("internal ", f" noinline{' cold' if rare else ''}") if within else ("", "")
@@ -261,12 +244,7 @@ class Code:
         return self._new(result, f"call {result or 'void'} {target}({given})")
 
     def outlined(
-        self,
-        name: str,
-        args: Sequence[Value],
-        body: Callable[..., Value | None],
-        result: Type | None = None,
-        rare: bool = False,
+        self, name: str, args: Sequence[Value], body: Callable[..., Any], result: Type | None = None, rare: bool = False
     ) -> Value:
         """Write a call of a function of its own, made of `body(*arguments)` when it is called first."""
         if not self.module.has(name):

@@ -225,20 +225,8 @@ def _composed(value: Callable[[Any], Any], slope: Callable[[Any, Any], Any]) -> 
 
 FUNCTIONS |= {name: _composed(*pair) for name, pair in COMPOSED.items()}
 OF_SCIPY = (
-    "gamma",
-    "gammainc",
-    "gammaincc",
-    "jv",
-    "yv",
-    "iv",
-    "kv",
-    "ellipk",
-    "ellipe",
-    "hyp2f1",
-    "expi",
-    "exp1",
-    "dawsn",
-)
+    "gamma", "gammainc", "gammaincc", "jv", "yv", "iv", "kv", "ellipk", "ellipe", "hyp2f1", "expi", "exp1", "dawsn",
+)  # fmt: skip
 """Functions of `scipy.special` that compiled code calls, at their addresses."""
 SPECIAL = "scipy_special_"  # with which their names in code begin
 

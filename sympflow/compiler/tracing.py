@@ -172,8 +172,8 @@ _OF_NUMPY = {"dim": "axis", "keepdim": "keepdims", "input": "x", "other": "y"}
 
 def _by_rule(rule: Callable[..., Any], args: tuple[Any, ...], options: dict[str, Any]) -> Any:
     """The result of a function of torch."""
-    if rule is TORCH["linear"] and is_tensor(args[1]) and args[1].requires_grad:
-        return _array(_linear_layer(*args, **options), TracedTensor)
+    if rule is TORCH["linear"] and is_tensor(args[1]) and (layer := _linear_layer(*args, **options)) is not None:
+        return _array(layer, TracedTensor)
     given = {_OF_NUMPY.get(key, key): _plain(x) for key, x in options.items() if key != "dtype"}
     return _wrapped(rule(*_plain(args), **given), TracedTensor)
 
@@ -652,11 +652,12 @@ class _Recorded(Recording):
     """Recorded operations of a function, in which roots are powers, as they are in formulas."""
 
     _inside = False
+    limited = True  # while a function is recorded
     layers: list[_Layer] | None = None
     """Linear layers whose weights require gradients, where these are taken."""
 
     def record(self, name: str, args: Sequence[Any]) -> Any:
-        if len(self) > MOST_OPERATIONS:
+        if self.limited and len(self) > MOST_OPERATIONS:
             raise Untraceable(f"it has more than {MOST_OPERATIONS:,} operations for one state")
         found = None if self._inside or len(args) != 2 else self._as_power(name, *args)
         if found is None:
@@ -688,11 +689,14 @@ class _Layer(NamedTuple):
     results: list[Traced]
 
 
-def _linear_layer(x: Any, weight: Any, bias: Any = None) -> np.ndarray:
+def _linear_layer(x: Any, weight: Any, bias: Any = None) -> np.ndarray | None:
+    """The results of a layer as new numbers, where layers are taken; None of one that is written out."""
     numbers = _raw(x) if isinstance(x, TracedArray) else _objects(x)
     recording = next((n.recording for n in numbers.flat if isinstance(n, Traced)), None)
     layers = recording.layers if isinstance(recording, _Recorded) else None
     tensors = [w for w in (weight, bias) if w is not None]
+    if layers is None and not any(w.requires_grad for w in tensors):
+        return None
     if (
         recording is None
         or layers is None
@@ -786,6 +790,7 @@ def _recorded(
         known = {"in place of a branch": BRANCH, "no float()": VALUE}
         reason = next((r for part, r in known.items() if part in shown), f"{type(error).__name__}: {shown[:160]}")
         raise Untraceable(reason) from error
+    recording.limited = False
     if value.shape != () or not isinstance(value[()], Traced | float | int | np.number):
         raise Untraceable(f"it returns an array of shape {value.shape} for one state")
     return inputs, value[()]

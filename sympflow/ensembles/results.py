@@ -316,7 +316,8 @@ class Ensemble(Shown):
         if state is not None:
             last = state[..., -1] if state.ndim == self.status.ndim + 2 else state
             q, p = last[..., 0].reshape(-1), last[..., d].reshape(-1)
-            return saved(points_figure(q, p, ("q", "p") if d == 1 else ("q₁", "p₁"), self.system.title), path)
+            title = f"{self.system.title}, t = {(self.t_span[1] if self.t is None else self.t[-1]):g}"
+            return saved(points_figure(q, p, ("q", "p") if d == 1 else ("q₁", "p₁"), title), path)
         values = {name: np.ravel(x).astype(float) for name, x in kept.items() if x.shape == self.status.shape}
         if not values:
             raise ValueError(f"`reduce` kept no number for each orbit, but {', '.join(kept)}: draw these yourself.")

@@ -39,6 +39,10 @@ DTYPES = {"F32": torch.float32, "F64": torch.float64}
 # writing ---------------------------------------------------------------------------------------------------
 
 
+OTHERS = (".pt", ".pth", ".ckpt", ".pkl", ".pickle", ".npz", ".npy", ".h5", ".hdf5", ".onnx", ".json", ".csv")
+"""Endings of files that other programs read."""
+
+
 def write(
     path: str | os.PathLike[str],
     kind: str,
@@ -49,6 +53,11 @@ def write(
 ) -> None:
     """Write a flow to a safetensors file, atomically: see `FlowMap.save`."""
     file = checked_path(path)
+    if file.suffix.lower() in OTHERS:
+        raise ValueError(
+            f"`path` {file.name!r} ends as a file of another format, and a flow is in that of safetensors: call it "
+            f"{file.stem}.safetensors."
+        )
     tensors = {name: value.detach().cpu().contiguous() for name, value in weights.items()}
     for name, value in tensors.items():
         if not torch.isfinite(value).all():

@@ -60,6 +60,11 @@ class PairsHamiltonian(LocalHamiltonian):
                 f"`cutoff` {self.cutoff:g} is longer than half the box, {self.box.min() / 2:g}: a body would meet "
                 "another and its image. Take a shorter one, or a larger `box`."
             )
+        self.signed = self.box is None and not self.softening  # bodies pass at r = 0 if they change places on a line
+        self.leaps = not self.softening
+        self.is_few = self.n_bodies * (self.n_bodies - 1) // 2 * self.dim <= MOST_WRITTEN  # pairs are written out
+        self._all_at_once = self.n_bodies <= ALL_AT_ONCE and self.cutoff is None
+        self.inertia = np.where(self.masses > 0, self.masses, 1.0)  # the momentum of each body over its velocity
         self._set_params(params)
         self._read(potential, {"m": self.masses, **self._checked_bodies(bodies)})
         mass = np.repeat(1 / self.inertia, self.dim)
@@ -73,11 +78,6 @@ class PairsHamiltonian(LocalHamiltonian):
         if not (self.masses > 0).all():
             i = int(np.argmin(self.masses))
             raise ValueError(f"`masses` must be positive; that of body {i} is {self.masses[i]:g}: change it.")
-
-    @property
-    def inertia(self) -> np.ndarray:
-        """The momentum of each body over its velocity."""
-        return self.masses
 
     def _checked_bodies(self, bodies: Any) -> dict[str, np.ndarray]:
         columns = {}
@@ -157,11 +157,6 @@ class PairsHamiltonian(LocalHamiltonian):
         return 2 * (pairs if self.cutoff is None else min(pairs, MOST_NEAR * self.n_bodies))
 
     @property
-    def is_few(self) -> bool:
-        """True of so few bodies that their pairs are written out."""
-        return self.n_bodies * (self.n_bodies - 1) // 2 * self.dim <= MOST_WRITTEN
-
-    @property
     def written(self) -> SymbolicHamiltonian | None:  # type: ignore[override]
         return self.spelled if self.is_few else None
 
@@ -194,8 +189,6 @@ class PairsHamiltonian(LocalHamiltonian):
                 term = sp.Piecewise((term, s < c[self.c[-1]]), (0, True))
             terms.append(term)
         return sp.Add(*terms)
-
-    # a few of many ----------------------------------------------------------------------------------------------------
 
     @property
     def uniform(self) -> bool:  # type: ignore[override]
@@ -277,11 +270,6 @@ class PairsHamiltonian(LocalHamiltonian):
             density = _added(_added(density, pairs.i, half), pairs.j, half)
         return density[..., 0]
 
-    @property
-    def signed(self) -> bool:
-        """True of bodies that pass at r = 0 if they change places on a line."""
-        return self.box is None and not self.softening
-
     @cached_property
     def poles(self) -> Poles | None:
         return PairsPoles(self) or None
@@ -328,11 +316,6 @@ class PairsHamiltonian(LocalHamiltonian):
         with np.errstate(all="ignore"):
             values = self._values(f"potential {key}", lambda: expressions, names, distances, *symbol_values)
         return [np.broadcast_to(value, distances.shape) for value in values]
-
-    @property
-    def leaps(self) -> bool:  # type: ignore[override]
-        """Bodies may meet at r = 0 without softening."""
-        return not self.softening and self.n_bodies > 1
 
     def leapt(self, starts: np.ndarray, ends: np.ndarray, n_steps: Any, conserves: bool) -> np.ndarray:
         """By an energy that is off by more than T + |V| of the start, and a T of more than twice that."""
@@ -413,10 +396,6 @@ class PairsHamiltonian(LocalHamiltonian):
             box = like(self.box, x)
             difference = difference - box * (difference / box).round()
         return difference
-
-    @property
-    def _all_at_once(self) -> bool:
-        return self.n_bodies <= ALL_AT_ONCE and self.cutoff is None
 
     def _ends(self, bodies: Sequence[Array]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Indices i < j of pairs, of all states (..., n, dim) together; the first array holds positions."""

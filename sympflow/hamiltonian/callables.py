@@ -34,7 +34,7 @@ from sympflow.arrays import (
 from sympflow.compiler.program import Program, derivatives, gradient, reached, traced
 from sympflow.compiler.tracing import WEIGHTS, Untraceable, trace, trace_chain
 from sympflow.hamiltonian.definition import Definition
-from sympflow.hamiltonian.formulas import TracedHamiltonian, TracedPoles, without_overflow
+from sympflow.hamiltonian.formulas import MOST_COMPILED, TracedHamiltonian, TracedPoles, without_overflow
 from sympflow.hamiltonian.function_checks import Tested, check_writes, probe_states, test
 from sympflow.hamiltonian.layered import LayeredPotential
 from sympflow.hamiltonian.linear_part import simplest
@@ -75,14 +75,18 @@ class CallableHamiltonian(Definition):
             raise TypeError("`gradient` and `hessian_vector` only go with `potential`: leave them out.")
         self.ndof, self.given, self.timed = ndof, bool(check), timed
         self.separable = potential is not None
+        self._name = "potential" if self.separable and not isinstance(potential, _AtRest) else "hamiltonian"
+        self._given_function: Any = potential if self.separable else hamiltonian
+        self._some_time = (0.0,) * timed
         self._functions = functions
         if _is_numba(gradient):
             _check_numba(potential, gradient, hessian_vector, "t, " * timed)
             self.numba_functions = given = potential, gradient, hessian_vector
             V, slope, product = (NumbaFunction(given, order) for order in range(3))
             functions = V, None, slope, None if hessian_vector is None else product
-        of_arrays = [None if f is None else _OverTimes(f) if timed else f for f in functions]
+        of_arrays = [None if f is None else partial(_over_times, f) if timed else f for f in functions]
         self._potential, self._hamiltonian, self._gradient, self._hessian_vector = of_arrays
+        self.given_functions = self.numba_functions is None
 
     def as_sum(self) -> tuple[CallableHamiltonian, np.ndarray | None, bool] | None:
         """The definition of H = T(p) + V(q) by V, M⁻¹, and whether T = ½ pᵀM⁻¹p; None of an H that is no such sum."""
@@ -114,10 +118,6 @@ class CallableHamiltonian(Definition):
     def identity_parts(self) -> Any:
         return [self.ndof, self._functions] if self.timed else [self.ndof, *self._functions]
 
-    @property
-    def given_functions(self) -> bool:  # type: ignore[override]
-        return self.numba_functions is None
-
     def place(self, y0: Any, domain: Any, inverse_mass: np.ndarray | None, t_span: tuple[float, float]) -> None:
         self._scene = y0, domain, inverse_mass, t_span
 
@@ -141,20 +141,21 @@ class CallableHamiltonian(Definition):
     def layered(self) -> LayeredPotential | None:
         *_, gradient, product = self._functions
         given = self.timed or gradient is not None or product is not None or not self.separable
-        if self.form is not None or self.untraced != WEIGHTS or given:
+        if given or (self.form is not None and self.form.size <= MOST_COMPILED) or self.library != "torch":
             return None
         y0, domain, inverse_mass, _ = self._scene
         try:
             chain = trace_chain(self._given_function, [f"q{i + 1}" for i in range(self.ndof)])
             found = LayeredPotential(self.ndof, chain, inverse_mass)
         except Untraceable as reason:
-            if str(reason) != WEIGHTS:
+            if self.untraced == WEIGHTS != str(reason):
                 self.untraced = f"{WEIGHTS}, and {reason}"
             return None
         states = probe_states(y0, domain, 2 * self.ndof)[:TRIED]
         if not _alike(found.value(states[:, : self.ndof]), self._values(states, [0.0] * len(states))):
             return None
-        self._known = states[0], 0.0, np.nan
+        if self.form is None:
+            self._known = states[0], 0.0, np.nan
         return found
 
     @cached_property
@@ -187,15 +188,6 @@ class CallableHamiltonian(Definition):
     def differentiates_itself(self) -> bool:  # type: ignore[override]
         *_, gradient, product = self._functions
         return gradient is None and product is None and not self.has_third_derivative
-
-    @property
-    def _name(self) -> str:
-        return "potential" if self.separable and not isinstance(self._functions[0], _AtRest) else "hamiltonian"
-
-    @property
-    def _given_function(self) -> Callable[..., Any]:
-        V, H, *_ = self._functions
-        return V if self.separable else H
 
     def _traced(self) -> TracedHamiltonian:
         """The program, compared with the functions."""
@@ -277,11 +269,11 @@ class CallableHamiltonian(Definition):
         """Raise a ValueError if the function has another value than when it was traced."""
         if self.guard is not None:
             self.guard()
-        if self.layered is not None:
+        if self.form is not None:
+            state, t, expected = self._known
+        elif self.layered is not None:
             state, t, _ = self._known
             expected = float(self.layered.value(state[None, : self.ndof])[0])
-        elif self.form is not None:
-            state, t, expected = self._known
         else:
             return
         with np.errstate(all="ignore"):
@@ -335,10 +327,6 @@ class CallableHamiltonian(Definition):
     @property
     def _reason(self) -> tuple[str, bool]:
         return self.untraced, self.library == "numpy"
-
-    @property
-    def _some_time(self) -> tuple[float, ...]:
-        return (0.0,) * self.timed
 
     def check(self, states: np.ndarray, like: Array, n_given: int, times: Sequence[float] = ()) -> None:
         """Test them against each other at states (n, 2d) in the library and dtype of `like`: see `function_checks`."""
@@ -625,32 +613,28 @@ class _AtRest:
 _ARGUMENTS = {"potential": "q", "hamiltonian": "q, p", "gradient": "q", "hessian_vector": "q, v"}
 
 
-class _OverTimes:
+def _over_times(function: Callable[..., Any], t: Any, *states: Array) -> Any:
     """A function of a user whose first argument is the time, one number: of states (..., k) at one time, or each."""
 
-    def __init__(self, function: Callable[..., Any]) -> None:
-        self.function = function
+    def at(t: Any, *states: Array) -> Any:
+        return function(beside(t, states[0]) if is_tensor(states[0]) else float(t), *states)
 
-    def __call__(self, t: Any, *states: Array) -> Any:
-        if not getattr(t, "ndim", 0):
-            return self._at(t, *states)
-        flat, times = [x.reshape(-1, x.shape[-1]) for x in states], t.reshape(-1)
-        if (found := values(times)) is not None and (found == found[..., :1]).all():
-            return self._at(times[0], *states)
-        if is_tensor(times):
-            each = [self._at(s, *(x[i] for x in flat)) for i, s in enumerate(times)]
-            return stack(each, axis=0).reshape(*t.shape, *each[0].shape)
-        distinct, which = np.unique(times, return_inverse=True)
-        groups = [np.flatnonzero(which == k) for k in range(len(distinct))]
-        parts = [self._at(s, *(x[rows] for x in flat)) for s, rows in zip(distinct.tolist(), groups, strict=True)]
-        for part, rows in zip(parts, groups, strict=True):
-            if getattr(part, "shape", ())[:1] != rows.shape:
-                return part  # which is refused by its shape
-        result = concatenate(parts, 0)[np.argsort(np.concatenate(groups))]
-        return result.reshape(*t.shape, *result.shape[1:])
-
-    def _at(self, t: Any, *states: Array) -> Any:
-        return self.function(beside(t, states[0]) if is_tensor(states[0]) else float(t), *states)
+    if not getattr(t, "ndim", 0):
+        return at(t, *states)
+    flat, times = [x.reshape(-1, x.shape[-1]) for x in states], t.reshape(-1)
+    if (found := values(times)) is not None and (found == found[..., :1]).all():
+        return at(times[0], *states)
+    if is_tensor(times):
+        each = [at(s, *(x[i] for x in flat)) for i, s in enumerate(times)]
+        return stack(each, axis=0).reshape(*t.shape, *each[0].shape)
+    distinct, which = np.unique(times, return_inverse=True)
+    groups = [np.flatnonzero(which == k) for k in range(len(distinct))]
+    parts = [at(s, *(x[rows] for x in flat)) for s, rows in zip(distinct.tolist(), groups, strict=True)]
+    for part, rows in zip(parts, groups, strict=True):
+        if getattr(part, "shape", ())[:1] != rows.shape:
+            return part  # which is refused by its shape
+    result = concatenate(parts, 0)[np.argsort(np.concatenate(groups))]
+    return result.reshape(*t.shape, *result.shape[1:])
 
 
 def _check_arguments(name: str, function: Callable[..., Any], arguments: str, timed: bool) -> None:

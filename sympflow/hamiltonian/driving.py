@@ -22,14 +22,13 @@ from sympflow.hamiltonian.expression import ELEMENTARY
 JUMP = 1e-9  # share of the largest value by which both sides of an end of an interval differ where samples jump
 MOST_TURNS = 10_000  # periods of samples, and zeros of a function, beyond which jumps are not listed
 
-# samples -------------------------------------------------------------------------------------------
-
 
 class Samples:
     """A function of t by the polynomials of a SciPy spline, a parameter of H."""
 
     def __init__(self, c: np.ndarray, x: np.ndarray, periodic: bool) -> None:
         self.c, self.x, self.periodic = c, x, periodic
+        self.span = float(x[0]), float(x[-1])  # the first and the last time
         for each in (c, x):
             each.setflags(write=False)
 
@@ -59,11 +58,6 @@ class Samples:
                 f"`params` has {name}, a spline that is not finite: give finite samples at two times at least."
             )
         return cls(np.ascontiguousarray(c[:, kept]), ends, spline.extrapolate == "periodic")
-
-    @property
-    def span(self) -> tuple[float, float]:
-        """The first and the last time of the samples."""
-        return float(self.x[0]), float(self.x[-1])
 
     @cached_property
     def jumps(self) -> np.ndarray:

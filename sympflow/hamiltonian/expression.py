@@ -117,7 +117,10 @@ def of_sympy(expression: sp.Basic, names: Collection[str] = ()) -> sp.Expr:
         raise Unreadable(f"it is a {type(expression).__name__}, not a number")
     spelled = _spelled(names)
     f = expression.xreplace(
-        {s: sp.Symbol(spelled.get(_normal(s.name), s.name), real=True) for s in expression.free_symbols}
+        {
+            s: sp.Symbol(spelled.get(unicodedata.normalize("NFKC", s.name), s.name), real=True)
+            for s in expression.free_symbols
+        }
     )
     return with_own_functions(f)
 
@@ -130,13 +133,9 @@ def complex_part(f: sp.Expr) -> sp.Expr | None:
     return min(powers, key=sp.default_sort_key, default=None)
 
 
-def _normal(name: str) -> str:
-    """The name as Python reads it in code: of the micro sign, for instance, the Greek letter."""
-    return unicodedata.normalize("NFKC", name)
-
-
 def _spelled(names: Collection[str]) -> dict[str, str]:
-    return {_normal(name): name for name in names}
+    """Names by how Python reads them in code: the micro sign, for instance, as the Greek letter."""
+    return {unicodedata.normalize("NFKC", name): name for name in names}
 
 
 def _check_characters(text: str) -> None:

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 
 MOST_IN_SYMBOLS = 300  # operations
+MOST_COMPILED = 5000  # operations of a gradient
 _JUMPING = {"sign", "floor", "mod", "where", "lt", "le", "eq", "atan2"}
 _BENDING = {"abs", "min", "max", "asin", "acos"}
 _SINGULAR = {"div": 1} | dict.fromkeys((
@@ -179,7 +180,8 @@ class TracedHamiltonian:
     @cached_property
     def size(self) -> int:
         """Operations of ∇V, or of ∇H."""
-        return len(self._slope)
+        n = len(self.program)
+        return len(self._slope) if n <= MOST_COMPILED else n
 
     @cached_property
     def driving(self) -> TracedDriving:

@@ -20,6 +20,9 @@ class Friction:
         if damping is not None and damping.ndim == 2:
             rates, self._modes = np.linalg.eigh(damping)
             self.rates = np.maximum(rates, 0.0)  # −0 and what rounding leaves below it
+        self.kind = None if damping is None else damping.ndim  # the axes of Γ, by which code for it is made
+        self.isotropic = self.rates.ndim == 0  # Γ = γ, of which the flow is conformally symplectic
+        self.largest = float(self.rates.max())
 
     def __reduce__(self) -> tuple[Any, ...]:
         return Friction, (None if self.damping is None else self.damping.copy(),)
@@ -33,21 +36,6 @@ class Friction:
             raise NotCompiled(
                 "`compensated` sums are for systems without friction, which forgets round-off: leave it out."
             )
-
-    @property
-    def kind(self) -> int | None:
-        """The number of axes of Γ, by which code for it is made; None without friction."""
-        return None if self.damping is None else self.damping.ndim
-
-    @property
-    def isotropic(self) -> bool:
-        """True for Γ = γ, one rate for all momenta: then the flow is conformally symplectic."""
-        return self.rates.ndim == 0
-
-    @property
-    def largest(self) -> float:
-        """The largest of the rates."""
-        return float(self.rates.max())
 
     def matrix(self, ndof: int) -> np.ndarray:
         """Γ as a matrix (d, d)."""

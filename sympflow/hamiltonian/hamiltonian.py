@@ -14,7 +14,7 @@ from sympflow.hamiltonian.formulas import TracedHamiltonian, recorded
 from sympflow.hamiltonian.friction import FRICTIONLESS, Friction
 from sympflow.hamiltonian.linear_part import checked_inverse_mass
 from sympflow.hamiltonian.times import checked_time
-from sympflow.show.cards import Shown
+from sympflow.show.cards import Shown, cut
 
 if TYPE_CHECKING:
     from sympflow.compiler.program import Program
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 
 
+UNNAMED = "custom"
 NEWTON, FOUND = 20, 1e-12  # steps at most, and the error of a velocity relative to the largest
 
 
@@ -82,6 +83,8 @@ class Hamiltonian:
         self.name = name
         self.definition = definition
         self.symbols: Any = definition.symbols
+        self.local: LocalHamiltonian | None = definition if definition.loops else None
+        """The definition by one piece, of a lattice or of pairs, with what it has of its own, such as `shape`."""
         self.ndof: int = definition.ndof
         self.separable: bool = definition.separable
         self._inverse_mass = inverse_mass
@@ -93,6 +96,12 @@ class Hamiltonian:
         self.numba_functions: Any = definition.numba_functions
         self.autonomous = not definition.timed
         self._tested: dict[tuple[type, Any], np.ndarray] = {}  # how far, by the kind of states
+
+    @property
+    def called(self) -> str:
+        """The name in messages; H of a formula without a name."""
+        unnamed = self.name == UNNAMED and self.symbols is not None
+        return repr(cut(f"H = {self.symbols.written[0]}", 60) if unnamed else self.name)
 
     def hamiltonian(self, y: Array, t: Any = None) -> Array:
         """H(y), or H(t, y): (..., 2d) to (...); a TypeError, as of all functions, where t is missing."""
@@ -148,7 +157,7 @@ class Hamiltonian:
         self._check_width(y)
         if self.local is None:
             raise ValueError(
-                f"`system` {self.name!r} has no energy density: that is of lattices and pairs, by "
+                f"`system` {self.called} has no energy density: that is of lattices and pairs, by "
                 "HamiltonianSystem.lattice and HamiltonianSystem.pairs."
             )
         return self.local.energy_density(y, *self._time(t, y))
@@ -190,14 +199,14 @@ class Hamiltonian:
     def as_doubled(self) -> Any:
         """Return the system itself if it is a doubled one; a ValueError if it is none."""
         raise ValueError(
-            f"`system` {self.name!r} is not doubled: its states are the physical ones: make one "
+            f"`system` {self.called} is not doubled: its states are the physical ones: make one "
             "by sympflow.doubled(system, force), or leave out what asks for its physical limit."
         )
 
     def lift(self, y: Array) -> Array:
         """The states (..., 2d) for `y` of another width; a ValueError but for doubled systems, which have such."""
         raise ValueError(
-            f"`y0` must have shape (..., {2 * self.ndof}) for {self.name!r}, [q, p] with {self.ndof} each; got "
+            f"`y0` must have shape (..., {2 * self.ndof}) for {self.called}, [q, p] with {self.ndof} each; got "
             f"{tuple(y.shape)}. Join q and p along the last axis, np.concatenate([q, p], axis=-1)."
         )
 
@@ -239,17 +248,17 @@ class Hamiltonian:
         """
         if self.external_force is not None:
             raise ValueError(
-                f"`system` {self.name!r} has an external force, p' = −∂H/∂q + F, {what}: solve it by a "
+                f"`system` {self.called} has an external force, p' = −∂H/∂q + F, {what}: solve it by a "
                 "Runge–Kutta method such as 'dop853', or its doubled system by any method, and judge the physical "
                 "solution by sympflow.reference_error(sol)."
             )
         if self.friction:
-            raise ValueError(f"`system` {self.name!r} has friction, p' = −∂H/∂q − Γp, {what}: {remedy}.")
+            raise ValueError(f"`system` {self.called} has friction, p' = −∂H/∂q − Γp, {what}: {remedy}.")
 
     def check_autonomous(self, what: str, remedy: str) -> None:
         """Refuse a driven system, H(t, q, p), by a ValueError with `what` leaves the time out and the remedy."""
         if not self.autonomous:
-            raise ValueError(f"`system` {self.name!r} is driven, H depends on t, {what}: {remedy}.")
+            raise ValueError(f"`system` {self.called} is driven, H depends on t, {what}: {remedy}.")
 
     @property
     def shortest_piece(self) -> float:
@@ -281,7 +290,7 @@ class Hamiltonian:
     def check_impulses(self, what: str, remedy: str) -> None:
         """Refuse a system with impulses, DiracDelta in t, by a ValueError with `what` omits them and the remedy."""
         if self.between_impulses is not self:
-            raise ValueError(f"`system` {self.name!r} has impulses, DiracDelta in H, {what}: {remedy}.")
+            raise ValueError(f"`system` {self.called} has impulses, DiracDelta in H, {what}: {remedy}.")
 
     def check_times(self, t0: float, t1: float) -> None:
         """Refuse an interval that leaves the times of sampled parameters, by a ValueError with these."""
@@ -300,7 +309,7 @@ class Hamiltonian:
             )
         if t is None:
             raise TypeError(
-                f"`t` is missing, the time: `system` {self.name!r} is driven, H depends on t. Give it after the state, "
+                f"`t` is missing, the time: `system` {self.called} is driven, H depends on t. Give it after the state, "
                 "as in system.hamiltonian(y, t)."
             )
         return (checked_time(t, x, x.shape[:-1]),)
@@ -379,7 +388,7 @@ class Hamiltonian:
     def _with_acceleration(self) -> Hamiltonian:
         if not self._separable().quadratic_kinetic:
             raise ValueError(
-                f"`system` {self.name!r} has no curvature terms, which are for a kinetic energy ½ pᵀM⁻¹p: leave them "
+                f"`system` {self.called} has no curvature terms, which are for a kinetic energy ½ pᵀM⁻¹p: leave them "
                 "out."
             )
         return self
@@ -458,7 +467,7 @@ class Hamiltonian:
     def _separable(self) -> Hamiltonian:
         if not self.separable:
             raise ValueError(
-                f"`system` {self.name!r} is not separable: H does not split into T(p) + V(q), so splitting methods do "
+                f"`system` {self.called} is not separable: H does not split into T(p) + V(q), so splitting methods do "
                 f"not apply. Use {self.definition.instead}."
             )
         return self
@@ -469,11 +478,6 @@ class Hamiltonian:
         if self.followed_mass is None:
             return self._inverse_mass
         return checked_inverse_mass(to_numpy(self.followed_mass), self.ndof)
-
-    @property
-    def local(self) -> LocalHamiltonian | None:
-        """The definition by one piece, of a lattice or of pairs, with what it has of its own, such as `shape`."""
-        return self.definition if self.definition.loops else None
 
     @property
     def form(self) -> SymbolicHamiltonian | TracedHamiltonian | None:
@@ -507,7 +511,7 @@ class Hamiltonian:
         form = self.form
         if form is None:
             why = f"its functions could not be traced: {self.untraced}" if self.untraced else "it is given by one piece"
-            raise ValueError(f"`system` {self.name!r} has no program, for {why}.")
+            raise ValueError(f"`system` {self.called} has no program, for {why}.")
         times = () if form.time is None else (form.time,)
         return recorded([form.H], (*times, *form.q, *form.p))
 

@@ -33,8 +33,6 @@ NEAR = 1e-3  # share of two places by which they differ, so that what jumps at o
 MOST_ROOTS = 64  # zeros in a state at which an expression is tried
 EPS = float(np.finfo(float).eps)
 
-# borders -------------------------------------------------------------------------------------------
-
 
 @dataclass(frozen=True)
 class Border:
@@ -503,9 +501,6 @@ def split_impulses(
         g = deltas[0].args[0]
         found[g] = found.get(g, sp.S.Zero) + W
     return sp.Add(*rest), {g: W for g, W in found.items() if W.free_symbols & q}
-
-
-# period --------------------------------------------------------------------------------------------
 
 
 def _leaves(f: sp.Basic, time: sp.Symbol, samples: Mapping[str, Samples]) -> Iterator[float]:

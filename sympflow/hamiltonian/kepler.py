@@ -208,9 +208,6 @@ def kepler_changes(x: Sequence[Any], v: Sequence[Any], mu: Any, t: Any, rates: S
     return moved(x, v, c) + varied((x, v), rates, c, known, found, 1.5 * left_out / bound)
 
 
-# elements ----------------------------------------------------------------------------------------------------------
-
-
 @np.errstate(all="ignore")
 def elements_of(x: np.ndarray, v: np.ndarray, mu: Any) -> np.ndarray:
     """Osculating elements (..., 6) of x and v (..., 3): a, e, inclination, node, argument of pericentre, M.

@@ -305,8 +305,6 @@ class LatticeHamiltonian(LocalHamiltonian):
             raise ValueError("`kinetic` has a mass that is 0 or infinite with the values in `params`: change them.")
         self.inverse_mass = inverse_mass
 
-    # the linear part ------------------------------------------------------------------------------------------------
-
     def linear_and_rest(self, interval: float) -> tuple[SpectralPart, list[Any]]:
         """The quadratic terms of sites and bonds as they are written, in normal modes, and U(q), the rest of V."""
         F, n_sites = len(self.fields), math.prod(self.shape)
@@ -384,11 +382,7 @@ class LatticeHamiltonian(LocalHamiltonian):
         return self._gathered(q, v, w)
 
     def kinetic(self, p: Array) -> Array:
-        return _total(self._kinetic_of_sites(p), self.shape)
-
-    def _kinetic_of_sites(self, p: Array) -> Array:
-        """T at each site: (..., d) to (..., *shape)."""
-        return self._at(None, "kinetic", lambda: [self.T], self.p, self._on_sites(p))[0]
+        return _total(self._at(None, "kinetic", lambda: [self.T], self.p, self._on_sites(p))[0], self.shape)
 
     def kinetic_gradient(self, p: Array) -> Array:
         slopes = self._at(None, "kinetic 1", partial(_slopes, self.T, self.p), self.p, self._on_sites(p))
@@ -410,7 +404,7 @@ class LatticeHamiltonian(LocalHamiltonian):
 
     def energy_density(self, y: Array, *t: Array) -> Array:
         x, p = self._on_sites(y[..., : self.ndof]), y[..., self.ndof :]
-        density = self._kinetic_of_sites(p)
+        density = self._at(None, "kinetic", lambda: [self.T], self.p, self._on_sites(p))[0]
         if self.U != 0:
             density = density + self._at(None, "onsite", lambda: [self.U], self.x, x)[0]
         for axis, k in self._kinds():

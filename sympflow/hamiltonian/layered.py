@@ -27,6 +27,7 @@ class LayeredPotential:
         self.first = chain.first
         self.sizes = [(w.shape[1], w.shape[0]) for w, _ in chain.layers]
         self.tensors = [x for pair in chain.layers for x in pair if x is not None]
+        self.n_weights = sum(x.numel() for x in self.tensors)
         if sum(map(sum, self.sizes)) > MOST_FEATURES or self.sizes[-1][1] > MOST_OUTPUTS:
             raise Untraceable(f"its layers have more than {MOST_FEATURES} features, or {MOST_OUTPUTS} at the end")
 
@@ -47,11 +48,6 @@ class LayeredPotential:
             n += (come + (bias is not None)) * go
         return found
 
-    @cached_property
-    def n_weights(self) -> int:
-        """Count of the numbers in the tensors."""
-        return sum(x.numel() for x in self.tensors)
-
     @property
     def weights(self) -> np.ndarray:
         """The numbers of all tensors as they are now."""
@@ -65,8 +61,6 @@ class LayeredPotential:
             a = to_numpy(weight) @ x + (0.0 if bias is None else to_numpy(bias)[:, None])
             x = chain.between[k](a)[0] if k < len(chain.between) else a
         return np.asarray(chain.last(*columns, *x)[0])
-
-    # what stages are made of ---------------------------------------------------------------------------------------
 
     @cached_property
     def activations(self) -> list[Program]:

@@ -79,7 +79,7 @@ class LinearPart(NormalModes):
 
     @cached_property
     def _spectrum(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """λ (d,), C (d, d), C⁻¹ (d, d)."""
+        """The eigenvalues of BK, (d,), negative for a hyperbolic mode, NaN for an idle one; C (d, d), C⁻¹ (d, d)."""
         B, K, d = self.inverse_mass, self.stiffness_matrix, self.ndof
         active = np.flatnonzero(np.diag(B) > 0)
         if np.delete(np.delete(B, active, 0), active, 1).any() or np.delete(K, active, 0).any():
@@ -98,11 +98,6 @@ class LinearPart(NormalModes):
         C[block] = L @ W / unit
         inverse[block] = unit[:, None] * (W.T @ np.linalg.inv(L))
         return squares, C, inverse
-
-    @property
-    def squared_frequencies(self) -> np.ndarray:
-        """The eigenvalues of BK, one for each mode, (d,): negative for a hyperbolic mode, NaN for an idle one."""
-        return self._spectrum[0]
 
     @property
     def modes(self) -> np.ndarray:
@@ -144,12 +139,12 @@ class LinearPart(NormalModes):
     def kinds(self) -> tuple[str, ...]:
         """The kind of each mode: "oscillator", "hyperbolic", "free" or "idle"."""
         names = {1.0: "oscillator", -1.0: "hyperbolic", 0.0: "free"}
-        return tuple("idle" if np.isnan(s) else names[float(np.sign(s))] for s in self.squared_frequencies)
+        return tuple("idle" if np.isnan(s) else names[float(np.sign(s))] for s in self._spectrum[0])
 
     @cached_property
     def rates(self) -> np.ndarray:  # type: ignore[override]
         """Ω of each mode, (d,): ω, the hyperbolic rate, 1 for a free mode and 0 for an idle one."""
-        squares = np.nan_to_num(self.squared_frequencies)
+        squares = np.nan_to_num(self._spectrum[0])
         return np.where(squares != 0, np.sqrt(np.abs(squares)), [float(kind == "free") for kind in self.kinds])
 
     @cached_property

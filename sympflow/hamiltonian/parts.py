@@ -90,6 +90,8 @@ class ExactParts:
         self.sequence = tuple(range(1, len(self.rest) + 1)) + (LINEAR,) * (linear is not None)
         if sequence is not None:
             self.sequence = tuple(sequence)
+        self.diagonal: bool = linear is None or linear.diagonal  # each mode is a coordinate
+        self.driven = any(functions.timed for functions in self.rest)
         self.center = linear.center if linear else np.zeros(ndof)
         self.classes = linear.classes if linear else np.zeros(ndof, dtype=int)
         self.n_classes = linear.n_classes if linear else 1
@@ -103,11 +105,6 @@ class ExactParts:
     def inverse_C(self) -> np.ndarray:
         return self.linear.inverse_modes if self.linear else np.eye(self.ndof)
 
-    @property
-    def diagonal(self) -> bool:
-        """True if each mode is a coordinate."""
-        return self.linear is None or self.linear.diagonal
-
     def __len__(self) -> int:
         return len(self.rest) + (self.linear is not None)
 
@@ -115,17 +112,10 @@ class ExactParts:
         """True if a part depends on the time, at which it then acts."""
         return part != LINEAR and bool(self.rest[part - 1].timed)
 
-    @property
-    def driven(self) -> bool:
-        """True if some part depends on the time."""
-        return any(functions.timed for functions in self.rest)
-
     def check_filters(self, part: int) -> None:
         """Raise unless the part, filtered, is still solved exactly: it must not come to hold a conjugate pair."""
         if not (self.diagonal or self.rest[part - 1].of_positions):
             raise ValueError("`filters` cannot act on a part that depends on momenta where modes are mixed: leave out.")
-
-    # normal modes -------------------------------------------------------------------------------------
 
     def to_modes(self, y: Array) -> tuple[Array, Array]:
         """X = C⁻¹(q − c), Y = Cᵀp."""
@@ -142,8 +132,6 @@ class ExactParts:
     def by_class(self, values: Array) -> Array:
         """Values for each frequency (..., F) as values for each mode (..., d)."""
         return values[..., self.classes]
-
-    # flows ----------------------------------------------------------------------------------------------
 
     def apply(self, maps: Sequence[SubFlow], X: Array, Y: Array, t: Any = 0.0, h: Any = 0.0) -> tuple[Array, Array]:
         """The maps of a step one after another, the first first; those of parts that move in a step h from t on."""

@@ -87,21 +87,13 @@ class Frame:
             [np.broadcast_to(heavy, self.order.shape), np.broadcast_to(light, self.test.shape)]
         )
         self.periods = 2 * np.pi * np.sqrt(self.size**3 / (G * (masses[0] + masses[1:])))
-
-    @property
-    def longest_step(self) -> float:
-        """The longest time between two kicks."""
-        return float(self.periods.min()) / FEWEST_STEPS
-
-    @cached_property
-    def bodies(self) -> np.ndarray:
-        """The bodies in the order of the coordinates."""
-        return np.concatenate([self.order, self.test])
-
-    @cached_property
-    def weights(self) -> list[float]:
-        """The share of each planet in the mass of all up to it."""
-        return (self.masses[self.order] / self.sums[1:]).tolist()
+        self.longest_step = float(self.periods.min()) / FEWEST_STEPS  # between two kicks
+        self.bodies = np.concatenate([self.order, self.test])  # in the order of the coordinates
+        self._places = np.argsort(np.concatenate([[0], self.bodies]))
+        self.weights = (masses[self.order] / self.sums[1:]).tolist()  # of each planet in the mass of all up to it
+        one, other = (self.order[i] for i in np.triu_indices(len(self.order), 1))
+        self.pairs = one, other  # of planets that have a mass
+        self.limits = ((encounter or 0.0) * self.hill_radii(one, other)) ** 2  # of squared distances, which end a run
 
     def hill_radii(self, i: Any, j: Any, share: float = 1.0) -> np.ndarray:
         """The mutual Hill radius of bodies; with a share of 0 that of i and bodies without mass."""
@@ -114,8 +106,6 @@ class Frame:
         q, p = (x.reshape(*y.shape[:-1], n, 3) for x in (y[..., : 3 * n], y[..., 3 * n :]))
         return q, p / like(self.inertia[:, None], p)
 
-    # transformations ----------------------------------------------------------------------------------------------
-
     def relative(self, q: Array) -> tuple[Array, Array]:
         """Jacobi's vectors (..., n − 1, 3) of vectors of the bodies (..., n, 3), and that of the centre (..., 3)."""
         R = q[..., 0, :]
@@ -124,7 +114,7 @@ class Frame:
             x.append(q[..., i, :] - R)
             R = R + w * x[-1]
             centres.append(R)
-        planets = stack(x, axis=-2)
+        planets = stack(x, axis=-2) if x else q[..., :0, :]
         if len(self.test):
             planets = concatenate([planets, q[..., self.test, :] - stack(centres, axis=-2)[..., self.inside, :]], -2)
         return planets, R
@@ -142,10 +132,6 @@ class Frame:
         if len(self.test):
             bodies = concatenate([bodies, x[..., n:, :] + stack(centres, axis=-2)[..., self.inside, :]], -2)
         return (bodies + (centre - R)[..., None, :])[..., self._places, :]
-
-    @cached_property
-    def _places(self) -> np.ndarray:
-        return np.argsort(np.concatenate([[0], self.bodies]))
 
     def into(self, y: Array) -> tuple[Array, Array, Array, Array]:
         """x and v of the planets (..., n − 1, 3), and the place and velocity of the centre (..., 3), of states."""
@@ -254,19 +240,6 @@ class Frame:
         d = q[..., i, :] - q[..., j, :]
         return (d * d).sum(-1) < like(self.limits, d)
 
-    @cached_property
-    def pairs(self) -> tuple[np.ndarray, np.ndarray]:
-        """The pairs of planets that have a mass."""
-        i, j = np.triu_indices(len(self.order), 1)
-        return self.order[i], self.order[j]
-
-    @cached_property
-    def limits(self) -> np.ndarray:
-        """The square of the distance of each pair that ends a run."""
-        return ((self.encounter or 0.0) * self.hill_radii(*self.pairs)) ** 2
-
-    # what does not suit ---------------------------------------------------------------------------------------------
-
     def check(self, method: str) -> None:
         """Raise a ValueError where some body is no planet of the star: bound to another one, or not bound at all."""
         masses = self.masses
@@ -335,6 +308,11 @@ class PlanetsHamiltonian(PairsHamiltonian):
         if encounter is not None and not (real_number(encounter) and 0 < encounter < math.inf):
             raise ValueError(f"`encounter` must be positive, in Hill radii, or None for none; got {encounter!r}.")
         super().__init__("-G*m1*m2/r", masses, 3, None, None, None, {"G": G}, None)
+        self.felt = None if (self.masses > 0).all() else np.repeat(np.where(self.masses > 0, 1.0, 0.0), 3)
+        self.is_few = self.is_few and self.felt is None and extra is None
+        self._all_at_once = self._all_at_once and self.felt is None
+        self._programs: dict[int, Program] = {}
+        self.in_terms = extra is not None
         self.start, self.coordinates, self.encounter = y0, coordinates, encounter
         self.columns = self.inertia[None]  # what bodies without mass feel is per unit mass
         self._take_extra(extra, params)
@@ -396,10 +374,6 @@ class PlanetsHamiltonian(PairsHamiltonian):
                 raise ValueError(f"`extra` cannot be differentiated: {error} Write it with other functions.") from error
         return self._programs[order]
 
-    @cached_property
-    def _programs(self) -> dict[int, Program]:
-        return {}
-
     def _of_extra(self, order: int, *arrays: Array) -> Array:
         """The numbers (..., n − 1, 1 or 3) that its program gives of arrays (..., d), per unit mass of a body."""
         q, *vectors = (self._of_bodies(a) for a in arrays)
@@ -425,28 +399,12 @@ class PlanetsHamiltonian(PairsHamiltonian):
         """Do nothing: bodies may have no mass."""
 
     @property
-    def inertia(self) -> np.ndarray:
-        return np.where(self.masses > 0, self.masses, 1.0)
-
-    @cached_property
-    def felt(self) -> np.ndarray | None:  # type: ignore[override]
-        return None if (self.masses > 0).all() else np.repeat(np.where(self.masses > 0, 1.0, 0.0), 3)
-
-    @property
     def arrays_only(self) -> str:  # type: ignore[override]
         """The reason why methods of other splittings have no compiled kicks; "" if they have."""
         if self.felt is not None:
             return "bodies without mass"
         few = self.ndof <= MOST_SPELLED and self.n_bodies * (self.n_bodies - 1) // 2 <= MOST_SPELLED_PAIRS
         return "" if self.extra is None or few else "an `extra` potential of many bodies"
-
-    @property
-    def in_terms(self) -> bool:  # type: ignore[override]
-        return self.extra is not None
-
-    @property
-    def is_few(self) -> bool:
-        return self.felt is None and self.extra is None and super().is_few
 
     def written_potential(
         self, q: Sequence[Any], softening: Any, columns: Sequence[Any], c: Mapping[Any, Any], box: Sequence[Any] = ()
@@ -461,10 +419,6 @@ class PlanetsHamiltonian(PairsHamiltonian):
             put = dict(zip(self._places, (*x, sp.sqrt(sp.Add(*(y**2 for y in x)))), strict=True))
             V += columns[0][i] * self.extra.xreplace({**own, **put})
         return V
-
-    @property
-    def _all_at_once(self) -> bool:
-        return self.felt is None and super()._all_at_once
 
     def _ends(self, bodies: Sequence[Array]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         if self.felt is None:
@@ -574,14 +528,16 @@ def _checked_elements(elements: Any, n: int) -> np.ndarray:
             )
         columns: Any = [elements.get(name, 0.0) for name in ELEMENTS]
     else:
-        columns = np.moveaxis(np.asarray(elements, dtype=float), -1, 0) if np.ndim(elements) else ()
+        columns = ()
     try:
+        columns = columns or np.moveaxis(np.asarray(elements, dtype=float), -1, 0)
         table = np.stack([np.broadcast_to(np.asarray(x, dtype=float), (n,)) for x in columns], axis=-1)
-    except ValueError:
+    except (TypeError, ValueError, IndexError):
         table = np.empty((0, 0))
     if table.shape != (n, 6):
         raise ValueError(
-            f"`elements` must give {', '.join(ELEMENTS)} of {n} planets: arrays ({n},), or one of shape ({n}, 6)."
+            f"`elements` must give {', '.join(ELEMENTS)} of {n} planets: arrays ({n},) by these names, as in "
+            f"{{'a': [...], 'e': [...]}}, or one of shape ({n}, 6)."
         )
     a, e, inclination = table[:, :3].T
     for bad, name, remedy in (

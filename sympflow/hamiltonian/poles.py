@@ -224,6 +224,7 @@ class PairsPoles(Poles):
 
     def __init__(self, pairs: Any) -> None:
         self._pairs, self._x = pairs, sp.Symbol("r", real=True)
+        self._on_a_line = pairs.dim == 1 and pairs.signed
         own = [s for s in pairs.of_distance.free_symbols if s.name == "r"]
         self._f = pairs.of_distance.xreplace({s: sp.Abs(self._x) if self._on_a_line else self._x for s in own})
         found, self._meeting = places(self._f, (self._x,)), sp.sign(self._x)
@@ -264,10 +265,6 @@ class PairsPoles(Poles):
     def visited(self, terms: Cancelling, y: np.ndarray) -> np.ndarray:
         found = np.concatenate([x for _, _, x, _ in self._pairs.met(y)], axis=-1)
         return found if self._on_a_line else np.abs(found)
-
-    @property
-    def _on_a_line(self) -> bool:
-        return self._pairs.dim == 1 and self._pairs.signed
 
     def _cells(self, x: np.ndarray, letters: Sequence[Any]) -> list[np.ndarray]:
         cells, r = [place.cell for place in self._places], x if self._on_a_line else np.abs(x)

@@ -397,8 +397,6 @@ class SymbolicHamiltonian(Definition):
         H = self.H if self.time is None else self.H.xreplace({self.time: sp.Symbol("t", real=True)})
         return [self.ndof, H, {name: samples.digest for name, samples in self.samples.items()}]
 
-    # generation -----------------------------------------------------------------------------------
-
     def _variables(self, name: str) -> tuple[sp.Symbol, ...]:
         return {"V": self.q, "T": self.p, "W": self.q, "drift": self.p}.get(name, self.q + self.p)
 
@@ -619,17 +617,14 @@ class _ParameterSymbols:
                     return number * int(value)
                 self.found[part] = sp.Symbol(f"parameter_{len(self.found)}", real=True), value
             return number * self.found[part][0]
-        if f.is_Add:
-            fixed = [a for a in f.args if a.free_symbols <= parameters]
-            moving = [self.put_into(a) for a in _ordered(f.args) if not a.free_symbols <= parameters]
-            return sp.Add(self.put_into(sp.Add(*fixed)), *moving)
-        if f.is_Mul:
-            fixed = [a for a in f.args if a.free_symbols <= parameters]
-            moving = [self.put_into(a) for a in _ordered(f.args) if not a.free_symbols <= parameters]
-            coefficient = self.put_into(sp.Mul(*fixed))
-            if len(moving) == 1 and moving[0].is_Add:  # as SymPy does it with a number
+        if f.is_Add or f.is_Mul:  # in an order that is the same in each process
+            ordered = sorted(f.args, key=sp.default_sort_key)
+            coefficient = f.func(*[a for a in f.args if a.free_symbols <= parameters])
+            moving = [self.put_into(a) for a in ordered if not a.free_symbols <= parameters]
+            coefficient = self.put_into(coefficient)
+            if f.is_Mul and len(moving) == 1 and moving[0].is_Add:  # as SymPy does it with a number
                 return sp.Add(*[coefficient * a for a in moving[0].args])
-            return sp.Mul(coefficient, *moving)
+            return f.func(coefficient, *moving)
         if f.is_Pow and f.base.free_symbols & parameters and (f.exp.is_Integer or not f.base.is_Mul):
             return self.put_into(f.base) ** self._replaced(f.exp)
         if isinstance(f, sp.Function) and len(f.args) == 1:
@@ -639,11 +634,6 @@ class _ParameterSymbols:
     def _replaced(self, f: sp.Expr) -> sp.Expr:
         self.replaced |= f.free_symbols & self.values.keys()
         return f.xreplace(self.values)
-
-
-def _ordered(args: Sequence[sp.Expr]) -> list[sp.Expr]:
-    """Arguments in an order that is the same in each process."""
-    return sorted(args, key=sp.default_sort_key)
 
 
 _AMBIGUOUS = {

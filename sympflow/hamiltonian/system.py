@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from dataclasses import fields as dataclass_fields
-from functools import cached_property, lru_cache
+from functools import cached_property
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, NoReturn, TypedDict, Unpack
 
@@ -22,7 +22,7 @@ from sympflow.hamiltonian.definition import bare_copy
 from sympflow.hamiltonian.domain import Domain, domain_of
 from sympflow.hamiltonian.fingerprint import fingerprint
 from sympflow.hamiltonian.friction import Friction
-from sympflow.hamiltonian.hamiltonian import Hamiltonian
+from sympflow.hamiltonian.hamiltonian import UNNAMED, Hamiltonian
 from sympflow.hamiltonian.linear_part import checked_damping, checked_inverse_mass, checked_stiffness, numeric
 from sympflow.hamiltonian.times import check_period, probe_times
 from sympflow.show.cards import Answering, Card, cut, numbers
@@ -49,7 +49,6 @@ SHOWN_NAMES = (
 """The attributes that `dir` lists: those that users need. All others are for methods and studies."""
 MOST_WRITTEN_OUT = 400
 """Coordinates of an expression before a warning: 512 of a chain take 2 s to define, and a step 14 times as long."""
-UNNAMED = "custom"
 MEANT = {
     **dict.fromkeys(("dim", "dimension", "dimensions"), "degrees of freedom of a function are `ndof`, of pairs `dim`."),
     "mass": "masses are in T(p), or `masses` of pairs.",
@@ -535,7 +534,7 @@ class HamiltonianSystem(Hamiltonian, Answering):
             Values of other names in `extra`.
         name, domain, y0, t_span, dt, energy_scale, exact
             As for the class; `t_span` is by default a thousand of the longest periods, `dt` a twentieth of the
-            shortest.
+            shortest; of planets that are bound to each other the step is chosen as for any system.
 
         Raises
         ------
@@ -552,9 +551,12 @@ class HamiltonianSystem(Hamiltonian, Answering):
 
         masses, G, y0 = checked_planets(masses, elements, scene.get("y0"), G, units)
         local = PlanetsHamiltonian(masses, G, y0, coordinates, encounter, extra, params)
-        span, dt = (0.0, 1000 * float(local.frame.periods.max())), local.frame.longest_step
+        span = (0.0, 1000 * float(local.frame.periods.max()))
+        with suppress(ValueError):  # of moons, whose step is left to the choice of the method
+            local.frame.check("kepler")
+            scene["dt"] = scene.get("dt") or local.frame.longest_step
         given = {name: value for name, value in scene.items() if value is not None} | {"y0": y0}
-        return cls._of_local(local, None, Scene.given(given, name="planets", t_span=span, dt=dt))
+        return cls._of_local(local, None, Scene.given(given, name="planets", t_span=span))
 
     def subsystem(
         self, sites: int | Sequence[int] | None = None, boundary: str | Sequence[str] = "periodic"
@@ -589,13 +591,13 @@ class HamiltonianSystem(Hamiltonian, Answering):
         """
         if self.local is None:
             raise TypeError(
-                f"`system` {self.name!r} is not a lattice, and only lattices have subsystems of a few sites: define it "
+                f"`system` {self.called} is not a lattice, and only lattices have subsystems of a few sites: define it "
                 "by HamiltonianSystem.lattice."
             )
         local = self.local.subsystem(sites, boundary)
         if self.damping is not None and self.damping.ndim:
             raise ValueError(
-                f"`damping` of {self.name!r} differs from site to site, and a subsystem needs sites that are alike: "
+                f"`damping` of {self.called} differs from site to site, and a subsystem needs sites that are alike: "
                 "give one rate."
             )
         domain = None
@@ -706,6 +708,7 @@ class HamiltonianSystem(Hamiltonian, Answering):
         """Make the system of a definition, in a scene."""
         Hamiltonian.__init__(self, scene.name, definition, inverse_mass, quadratic_kinetic)
         self.stiffness_matrix = stiffness_matrix
+        self._arguments = self.ndof if self.separable else 2 * self.ndof  # components of a state that functions take
         if stiffness_matrix is not None:
             stiffness_matrix.setflags(write=False)
         self.friction = Friction(checked_damping(damping, self.ndof))
@@ -775,6 +778,14 @@ class HamiltonianSystem(Hamiltonian, Answering):
         """True if `dt` was not given, and the system has no states from which it could be chosen."""
         return self._dt is None and self.y0 is None and self.domain is None
 
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Take the state of a pickle, of earlier versions too: they kept `params` as such, and tested no functions."""
+        earlier = {"functions_given": False, "_tested": {}, "_params": Parameters(state.get("params", {}))}
+        earlier |= {"_dt": state.get("dt"), "_inverse_mass": state.get("inverse_mass")}
+        earlier["local"] = state["definition"] if state["definition"].loops else None
+        now = {name: value for name, value in state.items() if name not in ("params", "dt", "inverse_mass")}
+        vars(self).update({**earlier, **now})
+
     @property
     def params(self) -> Mapping[str, float]:
         """The values of the parameters, read-only: they are part of H, from which all code is generated.
@@ -793,12 +804,12 @@ class HamiltonianSystem(Hamiltonian, Answering):
             return
         if self.symbols is None:
             raise TypeError(
-                f"`params` are of symbolic systems, and {self.name!r} is given by functions, which hold their values: "
+                f"`params` are of symbolic systems, and {self.called} is given by functions, which hold their values: "
                 "make a system for each, or define it with HamiltonianSystem.from_sympy(..., params=...)."
             )
         if self.external_force is not None:
             raise ValueError(
-                f"`params` of {self.name!r} are those of H and not of its external force: make a system for each value."
+                f"`params` of {self.called} are those of H and not of its external force: make a system for each value."
             )
         known = [s.name for s in self.symbols.written[1]]
         for name in names:
@@ -806,7 +817,7 @@ class HamiltonianSystem(Hamiltonian, Answering):
                 has = f"which has {', '.join(known)}" if known else "which has none: write H with symbols for them"
                 if name == "damping" and self.damping is not None:
                     has += "; `damping` is not one: make a system for each value"
-                raise ValueError(f"`params` has {name!r}, no parameter of {self.name!r}, {has}.")
+                raise ValueError(f"`params` has {name!r}, no parameter of {self.called}, {has}.")
 
     @told
     def with_params(self, **values: float) -> HamiltonianSystem:
@@ -906,11 +917,6 @@ class HamiltonianSystem(Hamiltonian, Answering):
         t0, t1 = self.t_span
         return [t0] if self.autonomous else probe_times(t0, t1 if length is None else t0 + length).tolist()
 
-    @property
-    def _arguments(self) -> int:
-        """The number of components of a state that the given functions depend on: V is one of q alone."""
-        return self.ndof if self.separable else 2 * self.ndof
-
     def kicks(self, t0: float, t1: float) -> list[Kick]:
         """Return the impulses of H between two times, in their order; each has its time `t`, and maps states.
 
@@ -924,8 +930,6 @@ class HamiltonianSystem(Hamiltonian, Answering):
         """
         return self.definition.kicks(t0, t1, self.dt / 4)
 
-    # structure --------------------------------------------------------------------------------------
-
     @cached_property
     def linear_part(self) -> LinearPart:
         """The quadratic part of H: K, its frequencies, the remaining potential U, and the `stiffness`.
@@ -935,8 +939,6 @@ class HamiltonianSystem(Hamiltonian, Answering):
         from sympflow.hamiltonian.linear_part import linear_part
 
         return linear_part(self)
-
-    # identity -------------------------------------------------------------------------------------
 
     @cached_property
     def fingerprint(self) -> tuple[float, ...]:
@@ -1018,41 +1020,38 @@ COUNTED = {
 """The functions of a system that are counted, and as what."""
 
 
-def counting_view(system: HamiltonianSystem, count: Callable[[str, Array], None]) -> HamiltonianSystem:
-    """Return a view of the system that tells `count` of each evaluation of a force or a derivative of it."""
-    view = copy.copy(system)
-    vars(view).pop("between_impulses", None)  # the view itself, where there are none
-    view.__class__ = _counting_class(type(system))
-    view._original, view._count, view._inside = system, count, False  # type: ignore[attr-defined]
-    return view
+class counting_view:
+    """A view of a system that tells `count` of each evaluation of a force or a derivative of it, not of inner ones."""
 
+    def __init__(self, system: HamiltonianSystem, count: Callable[[str, Array], None]) -> None:
+        self._system, self._count = system, count
 
-@lru_cache(maxsize=64)
-def _counting_class(cls: type[HamiltonianSystem]) -> type[HamiltonianSystem]:
-    def counted(name: str) -> Callable[..., Array]:
-        def evaluate(self: Any, x: Array, *more: Array, **named: Array) -> Array:
-            function = getattr(super(view, self), name)
-            if self._inside:  # one of them may call another
-                return function(x, *more, **named)
-            self._inside = True
-            try:
-                value = function(x, *more, **named)
-            finally:
-                self._inside = False
+    @property  # type: ignore[misc]
+    def __class__(self) -> Any:
+        return type(self._system)
+
+    def __getattr__(self, name: str) -> Any:
+        found = getattr(self._system, name)
+        if name not in COUNTED:
+            return self if found is self._system else found  # as between impulses, where there are none
+
+        def evaluate(x: Array, *more: Array, **named: Array) -> Array:
+            value = found(x, *more, **named)
             self._count(COUNTED[name], x)
             return value
 
         return evaluate
 
-    view: Any = type(
-        cls.__name__,
-        (cls,),
-        {
-            **{name: counted(name) for name in COUNTED},
-            "__hash__": lambda self: hash(self._original),
-            "__eq__": lambda self, other: other is self or other is self._original,
-            "__reduce__": lambda self: (copy.copy, (self._original,)),
-            "__doc__": cls.__doc__,
-        },
-    )
-    return view
+    def __call__(self, t: Any, y: Array) -> Array:
+        value = self._system(t, y)
+        self._count(COUNTED["vector_field"], y)
+        return value
+
+    def __hash__(self) -> int:
+        return hash(self._system)
+
+    def __eq__(self, other: object) -> bool:
+        return other is self or other is self._system
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return copy.copy, (self._system,)

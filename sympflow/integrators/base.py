@@ -123,10 +123,18 @@ class FixedStep(Integrator):
         )
         return states, finite, library_name(problem.y0)
 
+    def on_clock(self, system: HamiltonianSystem) -> Any:
+        """Return the method on its clock, where that is not the physical one."""
+        return None
+
     def run(self, problem: Problem) -> Outcome:
-        return grid_run(self, problem).outcome()
+        clock = self.on_clock(problem.system)
+        return grid_run(self, problem).outcome() if clock is None else clock.run(problem)
 
     def steps(self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array) -> Steps:
+        if (clock := self.on_clock(system)) is not None:
+            yield from clock.steps(t_span, y0)
+            return
         stepper, chunk, y = self.stepper(Problem(system, *t_span, y0)), 256, y0
         for piece in pieces_of(self, system, *t_span):
             grid, k = Grid(*piece, self.step_length(system)), 0
@@ -178,7 +186,7 @@ class OwnSteps(ArraySteps):
         self.takes_carry = _definer(type(integrator), "rollout") is FixedStep
         if counted:
             self.counts = {"force_evaluations": 0, "hessian_evaluations": 0}
-            self.problem = replace(problem, system=counting_view(problem.system, self._count))
+            self.problem = replace(problem, system=counting_view(problem.system, self._count))  # type: ignore[arg-type]
 
     def _count(self, what: str, x: Array) -> None:
         assert isinstance(self.counts, dict)
@@ -239,9 +247,6 @@ class Recorder:
         """Look for events in an interval of length zero."""
         if self.search is not None:
             self.search.step(t, y, t, y, lambda s: y)
-
-
-# events of integrators that do not look for them themselves ------------------------------------------
 
 
 def run_and_search(integrator: Integrator, problem: Problem, search: EventSearch) -> Outcome:

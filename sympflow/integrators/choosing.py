@@ -67,7 +67,7 @@ def choose_method(
             refused = refused or error
             continue
         return integrator, reason
-    raise refused or ValueError(f"`system` {system.name!r} has no method that applies: pass `method`.")
+    raise refused or ValueError(f"`system` {system.called} has no method that applies: pass `method`.")
 
 
 def _candidates(
@@ -186,9 +186,6 @@ def with_step(integrator: Integrator, system: HamiltonianSystem, y0: np.ndarray)
     if not (system.step_is_open and isinstance(integrator, FixedStep)) or integrator.trained or integrator.dt:
         return integrator
     return replace(integrator, dt=default_step(system, y0))
-
-
-# the step ------------------------------------------------------------------------------------------------------
 
 
 def choose_step(

@@ -66,8 +66,6 @@ class LogarithmicClock(NamedTuple):
         """c, of the transformed system."""
         return self.transformed.params["shift"]
 
-    # one step -------------------------------------------------------------------------------------
-
     def step(self, y: Array, h: float | Array, t: Any = 0.0) -> Array:
         """One step of the physical length h, with B = c − H(y)."""
         rows, lengths = _rows(y, h)
@@ -110,8 +108,6 @@ class LogarithmicClock(NamedTuple):
                     break
                 longest = np.where(short, 2 * longest, longest)
             return reach(step, start, longest, h, h * speed)
-
-    # a run ----------------------------------------------------------------------------------------
 
     def run(self, problem: Problem) -> Outcome:
         """Solve the problem."""

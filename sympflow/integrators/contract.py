@@ -34,7 +34,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import Field, dataclass, field, fields
 from enum import Enum
-from functools import cache
+from functools import cache, partial
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
@@ -333,8 +333,8 @@ class Integrator:
         self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array
     ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
         """The steps of the run, differentiated where they were made: times and lengths (n, ...), Jacobians as above."""
-        for times, states, lengths in in_blocks(self.steps(system, t_span, y0)):
-            yield differentiated(lambda t, y, h: self.tangent(system, t, y, h)[1], times, states, lengths)
+        for times, states, lengths in in_blocks(self.own_steps(system, t_span, y0)):
+            yield differentiated(partial(self.jacobian, system), times, states, lengths)
 
     def run(self, problem: Problem) -> Outcome:
         """Solve the problem."""
@@ -343,6 +343,10 @@ class Integrator:
     def steps(self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array) -> Steps:
         """Execute the run again as a stream of its steps."""
         raise NotImplementedError(f"{type(self).__name__} must define steps().")
+
+    def own_steps(self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array) -> Steps:
+        """The same in the phase space where steps are made."""
+        return self.steps(system, t_span, y0)
 
 
 class ByVectorField(Integrator):

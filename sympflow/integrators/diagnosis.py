@@ -59,6 +59,7 @@ NO_FORCE = (
 STATES_COMPARED, MOST_COMPARED = 16, 64
 """Outputs of a run, and states of a batch, at which H is compared with that of the flow."""
 MANY_TIMES = 1000.0  # times the certified energy error of a flow beyond which an error outside its domain is warned of
+MANY_STEPS = 100.0  # times the error of one step of a flow without a certificate
 _TOLD: WeakSet[Any] = WeakSet()
 
 
@@ -696,22 +697,26 @@ def warn_of_leap(outcome: Outcome, system: HamiltonianSystem, y0: Array) -> bool
 def warn_of_loss(outcome: Outcome, integrator: Integrator, system: HamiltonianSystem, y0: Array) -> None:
     """Warn of a run that left the domain of its flow and lost far more energy than the flow does inside."""
     flow = integrator.known_flow(system)
-    certificate = None if flow is None else flow.certified
-    if certificate is None or "domain_exit" not in outcome.stats or not system.keeps_energy:
+    if flow is None or "domain_exit" not in outcome.stats or not system.keeps_energy:
         return
     width = 2 * system.ndof
     with np.errstate(all="ignore"):
-        H0, H = (system.hamiltonian(to_numpy(y).reshape(-1, width)) for y in (y0, outcome.y[-1]))
-        error = np.abs(H - H0) / (system.energy_scale or np.maximum(np.abs(H0), np.abs(H)))
-    held = certificate.relative_limit or certificate.relative_energy_error.largest
-    off = error > MANY_TIMES * held
-    if not off.any():
+        y = to_numpy(outcome.y[:: -max(1, len(outcome.y) // LOOKED_AT)] if readable(outcome.y) else outcome.y[-1:])
+        H0, H = system.hamiltonian(to_numpy(y0).reshape(-1, width)), system.hamiltonian(y.reshape(len(y), -1, width))
+        error = np.fmax.reduce(np.abs(H - H0) / (system.energy_scale or np.maximum(np.abs(H0), np.abs(H))))
+    certificate, figures = flow.certified, flow.figures
+    known, held, times = "has an error in one step of", figures.get("one_step_error_max") or 0.0, MANY_STEPS
+    if certificate is not None:
+        held = certificate.relative_limit or certificate.relative_energy_error.largest
+        known, times = "is certified for", MANY_TIMES
+    off = error > times * held
+    if not (held and off.any()):
         return
     row = int(np.argmax(np.where(off, error, 0)))
     which = "" if len(off) == 1 else f" of trajectory {row}, the worst of {off.sum()} such,"
     warn(
         f"The state left the domain of the flow at t = {outcome.stats['domain_exit']:.10g}, and the relative energy "
-        f"error{which} is {error[row]:.2g} at t = {outcome.t[-1]:.10g}: the flow is certified for {held:.2g} inside. "
+        f"error{which} is {error[row]:.2g}: the flow {known} {held:.2g} inside. "
         "Start inside its `domain`, train a flow on one that holds these states, or take a scheme such as 'srkn11b'.",
         RuntimeWarning,
     )

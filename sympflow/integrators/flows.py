@@ -100,6 +100,7 @@ class FlowIntegrator(FixedStep):
     order: ClassVar[int | None] = None
     trained: ClassVar[bool] = True
     compiles: ClassVar[bool] = True
+    tol: ClassVar[float | None] = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -114,11 +115,6 @@ class FlowIntegrator(FixedStep):
             )
 
     @property
-    def tolerance(self) -> float | None:
-        """The energy error by which the shipped flow is chosen, where there is a choice."""
-        return None
-
-    @property
     def given_flow(self) -> FlowMap | None:
         return self.flow
 
@@ -127,7 +123,7 @@ class FlowIntegrator(FixedStep):
         return self.known_flow(system).thawed
 
     def known_flow(self, system: HamiltonianSystem) -> KnownFlow:
-        return _shipped(system, self.name, self.tolerance) if self.flow is None else self.flow.bound(system)
+        return _shipped(system, self.name, self.tol) if self.flow is None else self.flow.bound(system)
 
     def on_extended(self, system: HamiltonianSystem, extended: HamiltonianSystem) -> FlowIntegrator | None:
         flow = self.flow_for(system).on_extended(extended)
@@ -156,7 +152,7 @@ class FlowIntegrator(FixedStep):
             return flow
         if self.flow is None:
             dtype, device = tensor.dtype, tensor.device
-            key = (self.name, kind_of(system), self.tolerance, dtype, device)
+            key = (self.name, kind_of(system), self.tol, dtype, device)
             return known(key, lambda: copy.deepcopy(flow).to(dtype=dtype, device=device))
         if tensor.dtype != flow.dtype:
             raise TypeError(
@@ -187,7 +183,7 @@ class FlowIntegrator(FixedStep):
 
     def run(self, problem: Problem) -> Outcome:
         run = grid_run(self, problem)
-        if self.tolerance is not None:
+        if self.tol is not None:
             check_start(self.known_flow(problem.system), problem.system, problem.y0, run.stepper.compiled)
         return run.outcome()
 
@@ -291,7 +287,7 @@ class SympFlowIntegrator(FlowIntegrator):
        neural integrators" (2024).
     """
 
-    tol: float | None = None
+    tol: float | None = None  # type: ignore[misc]
     compensated: bool = False
     name: ClassVar[str] = "sympflow"
     source: ClassVar[str] = "A trained SympFlow: symplectic for every step length, with an exact inverse."
@@ -308,10 +304,6 @@ class SympFlowIntegrator(FlowIntegrator):
         for name in ("flow", "dt"):
             if getattr(self, name) is not None:
                 raise ValueError(f"`tol` chooses the flow and its Δt, but `{name}` is given: leave out one of them.")
-
-    @property
-    def tolerance(self) -> float | None:
-        return self.tol
 
     @property
     def in_another_time(self) -> bool:  # type: ignore[override]
@@ -506,9 +498,3 @@ class LogSympFlow(FixedStep):
 
     def tangent(self, system: HamiltonianSystem, t: float, y: Array, h: Array) -> tuple[np.ndarray, np.ndarray]:
         return self.on_clock(system).tangent(y, h)
-
-    def run(self, problem: Problem) -> Outcome:
-        return self.on_clock(problem.system).run(problem)
-
-    def steps(self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array) -> Steps:
-        return self.on_clock(system).steps(t_span, y0)

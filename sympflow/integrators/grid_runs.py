@@ -350,9 +350,6 @@ class MemoryRun(GridRun):
         return outcome
 
 
-# events ---------------------------------------------------------------------------------------------------------------
-
-
 class SearchedRun(GridRun):
     """A run of one trajectory with events: the steps of each window are searched before the next is computed."""
 
@@ -448,9 +445,6 @@ class SearchedRun(GridRun):
             return self.stepper.shorter(repeated, like(lengths, repeated), t)
 
 
-# a store --------------------------------------------------------------------------------------------------------------
-
-
 class StoredRun(GridRun):
     """A run whose outputs a store takes; the outcome has none. A run that was stored before goes on."""
 
@@ -462,6 +456,7 @@ class StoredRun(GridRun):
                 "another fixed-step method, or leave `store` out."
             )
         shape = problem.y0.shape
+        self._nothing = np.empty(0), problem.y0[None][:0]  # of an outcome whose outputs are in a store
         self.store, self.most = store, max(2, MOST_SAVED // math.prod(shape))
         self.state: Array = problem.y0
         self.failed = np.zeros(shape[:-1], dtype=bool)
@@ -481,11 +476,6 @@ class StoredRun(GridRun):
             if place is not None:
                 self._begin(place)
             return super().outcome()
-
-    @property
-    def _nothing(self) -> tuple[np.ndarray, Array]:
-        """No times and no states, as of an outcome whose outputs are in a store."""
-        return np.empty(0), self.problem.y0[None][:0]
 
     def _begin(self, place: Place) -> None:
         """Take up the run at a place."""

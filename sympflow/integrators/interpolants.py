@@ -43,6 +43,10 @@ class Interpolant:
         self.begin, self.end, self.y0, self._values = begin, end, y0, values
         self.t0, self.t1 = (float(detached(t)) for t in (begin, end))
 
+    def __getstate__(self) -> dict[str, Any]:
+        """The values in place of the steps that they are taken from."""
+        return {**vars(self), "values": self.values, "_values": None}
+
     @cached_property
     def values(self) -> tuple[np.ndarray, list[Array]]:
         """The polynomials of the values, and these."""

@@ -38,11 +38,6 @@ class Progress:
         elif self.draws:
             self._draw(done, now - self.begin)
 
-    @property
-    def complete(self) -> bool:
-        """True if the total has been told."""
-        return bool(self.done == self.total)
-
     def end(self) -> None:
         """Leave the bar as it is, and begin a new line."""
         if self.draws and self.first is not None:

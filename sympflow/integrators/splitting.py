@@ -24,9 +24,7 @@ from sympflow.integrators.contract import (
     Outcome,
     Problem,
     Steps,
-    differentiated,
     forward_tangent,
-    in_blocks,
     method_class,
 )
 from sympflow.integrators.interpolants import Mapped
@@ -345,21 +343,11 @@ class Splitting(FixedStep):
         if not self.keeps:
             return super().jacobian(system, t, y, h)
         composition = self.composed(system)
-        return forward_tangent(lambda x, lengths: composition.step(x, lengths, t), composition.lift(y), h)[1]
+        lifted = y if y.shape[-1] > 2 * system.ndof else composition.lift(y)
+        return forward_tangent(lambda x, lengths: composition.step(x, lengths, t), lifted, h)[1]
 
-    def executed(
-        self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array
-    ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-        if not self.keeps:
-            yield from super().executed(system, t_span, y0)
-            return
-        composition = self.composed(system)
-
-        def jacobian(t: Any, x: np.ndarray, h: np.ndarray) -> np.ndarray:
-            return forward_tangent(lambda z, lengths: composition.step(z, lengths, t), x, h)[1]
-
-        for times, states, lengths in in_blocks(super().steps(system, t_span, composition.lift(y0))):
-            yield differentiated(jacobian, times, states, lengths)
+    def own_steps(self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array) -> Steps:
+        return super().steps(system, t_span, self.composed(system).lift(y0) if self.keeps else y0)
 
     def own_stepper(self, problem: Problem) -> Stepper:
         composition, compensated = self.composed(problem.system), bool(self.compensated)
@@ -367,21 +355,15 @@ class Splitting(FixedStep):
         return stepper_of(self, problem, composition, partial(make, compensated), compensated)
 
     def run(self, problem: Problem) -> Outcome:
-        clock = self.on_clock(problem.system)
-        if clock is not None:
-            return clock.run(problem)
-        return (
-            _extended_run(super().run, self.composed(problem.system), problem) if self.keeps else super().run(problem)
-        )
+        if not self.keeps:
+            return super().run(problem)
+        return _extended_run(super().run, self.composed(problem.system), problem)
 
     def steps(self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array) -> Steps:
-        clock = self.on_clock(system)
-        if clock is not None:
-            yield from clock.steps(t_span, y0)
-            return
-        composition = self.composed(system)
-        for times, states, lengths in super().steps(system, t_span, composition.lift(y0)):
-            yield times, composition.project(states), lengths
+        if not self.keeps:
+            return self.own_steps(system, t_span, y0)
+        project = self.composed(system).project
+        return ((times, project(states), lengths) for times, states, lengths in self.own_steps(system, t_span, y0))
 
 
 # runs on an extended phase space -----------------------------------------------------------------
@@ -454,9 +436,6 @@ def _note_distance(extension: Composition, found: np.ndarray, outcome: Outcome) 
             "the copies are bound.",
             RuntimeWarning,
         )
-
-
-# options -----------------------------------------------------------------------------------------
 
 
 def _check_parts(parts: Any) -> None:

@@ -71,7 +71,8 @@ class Stepper:
         told: Sequence[str] = (),
     ) -> None:
         self.integrator, self.system, self.problem = integrator, problem.system, problem
-        self.arrays, self.kernel = arrays, kernel
+        self.arrays, self.kernel, self.compiled = arrays, kernel, kernel is not None
+        self.counts_itself = arrays.counts is not None or arrays.stages > 0  # whatever the steps
         self.saves_finite = kernel is not None and kernel.saves_finite  # of saved states up to the last finite one
         self.remark = self.why = ""  # the reasons why a formula is not compiled, and functions of Python run as such
         y0, untraced = problem.y0, None if kernel is not None or problem.system is None else problem.system.untraced
@@ -80,11 +81,6 @@ class Stepper:
             self.why = f": `{name}` could not be traced, for {untraced}"
         if told and problem.system.symbols is not None:
             self.remark = f" Its steps were array operations: {_ADVICE.sub('.', told[0])}"
-
-    @property
-    def compiled(self) -> bool:
-        """True if the steps run in compiled loops."""
-        return self.kernel is not None
 
     @property
     def backend(self) -> str:
@@ -105,11 +101,6 @@ class Stepper:
     def followed(self) -> Sequence[Any]:
         """The tensors besides y0 to which gradients of compiled loops flow: parameters, or weights in H."""
         return [*self.problem.followed.values()] or (() if self.kernel is None else self.kernel.tensors)
-
-    @property
-    def counts_itself(self) -> bool:
-        """True if `evaluations` tells those that were made so far, whatever the steps."""
-        return self.arrays.counts is not None or self.arrays.stages > 0
 
     def rollout(
         self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0, carry: RunCheckpoint | None = None

@@ -42,8 +42,10 @@ Visit = Callable[[Interpolant], bool]  # takes a step as soon as it is accepted;
 class Trace:
     """The right-hand side that torchdiffeq is given, in elapsed time: it counts its calls and announces the steps."""
 
-    def __init__(self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array, visit: Visit) -> None:
-        self.system, self.visit, self.t_span = system, visit, t_span
+    def __init__(
+        self, method: Any, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array, visit: Visit
+    ) -> None:
+        self.method, self.system, self.visit, self.t_span = method, system, visit, t_span
         self.direction = math.copysign(1.0, t_span[1] - t_span[0])
         self.tensor = is_tensor(y0)
         self.evaluations = self.n_steps = 0
@@ -81,6 +83,72 @@ class Trace:
             raise _EndedError
 
 
+class _Stages(Trace):
+    """Collects the slopes of each step: torchdiffeq interpolates from them."""
+
+    def __init__(self, method: Adaptive, *arguments: Any) -> None:
+        super().__init__(method, *arguments)
+        self.tableau = method.tableau
+        self.first: Any = None
+        self.slopes: list[Any] = []
+
+    def evaluated(self, y: Any, f: Any) -> None:
+        self.slopes.append(f)
+
+    def callback_step(self, s: Any, y: Any, dt: Any) -> None:
+        """A step is tried. Its first slope is the last of the step before, or at the start that of the state."""
+        self.n_tried += 1
+        self.first = self.slopes[0] if self.first is None else self.first
+        self.slopes.clear()
+
+    def callback_accept_step(self, s: Any, y: Any, dt: Any) -> None:
+        K, y = [self.array(f) for f in (self.first, *self.slopes)], self.array(y)
+        if not differentiable(s, dt):
+            s, dt = float(s), float(dt)
+        t0, t1 = (self.t_span[0] + self.direction * x for x in (s, s + dt))
+        self.first = self.slopes[-1]
+        self.announce(Interpolant(t0, t1, y, lambda: self._inside(t0, t1, y, K)))
+
+    def _inside(self, t0: Any, t1: Any, y: Array, K: list[Array]) -> tuple[list[Array], list[Array]]:
+        """The states and slopes of a step that it is interpolated from."""
+        h, tableau = t1 - t0, self.tableau
+        states, slopes = [y, y + h * weighted(tableau.B, K)], [K[0], K[-1]]
+        if tableau.middle:
+            states.append(y + h * weighted(tableau.middle, K))
+        elif tableau.order > 3:  # of a cubic
+            states += [self.method.step(self.system, t0, y, x * h) for x in THIRDS]
+            slopes += [self.system.vector_field(z, t0 + x * h) for x, z in zip(THIRDS, states[2:], strict=True)]
+            self.evaluations += len(THIRDS) * (len(tableau.B) + 1)
+        return states, slopes
+
+
+class _Nodes(Trace):
+    """Follows the grid: the first slope that is asked for in a step is that at its beginning."""
+
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        grid = Grid(*self.t_span, self.method.step_length(self.system))
+        self.times = [grid.t0 + k * grid.h for k in range(grid.n_steps + bool(grid.remainder))] + [grid.t1]
+        self.before: tuple[Array, Array] | None = None
+        self.begins = False
+
+    def callback_step(self, s: Any, y: Any, dt: Any) -> None:
+        self.begins = True
+
+    def evaluated(self, y: Any, f: Any) -> None:
+        if not self.begins:
+            return
+        self.begins = False
+        if not (y.isfinite().all() and f.isfinite().all()):
+            raise AssertionError("the state is not finite; reduce `dt`")
+        y, f = self.array(y), self.array(f)
+        before, self.before = self.before, (y, f)
+        if before is not None:
+            k = self.n_steps
+            values = (before[0], y), (before[1], f)
+            self.announce(Interpolant(self.times[k], self.times[k + 1], before[0], lambda: values))
+
+
 class _EndedError(Exception):
     """Raised to leave torchdiffeq's loop at a terminal event."""
 
@@ -93,6 +161,8 @@ class Watched(ByVectorField):
     """A method of torchdiffeq that interpolates: outputs, events and dense output are one polynomial in each step."""
 
     finds_events: ClassVar[bool] = True
+    trace: ClassVar[type[Trace]]
+    max_num_steps: ClassVar[int | None] = None  # of a call, those that are tried and rejected included
 
     def outputs(self, problem: Problem) -> tuple[np.ndarray, dict[str, Any]]:
         """The times to report, and what the statistics say of the steps."""
@@ -113,8 +183,8 @@ class Watched(ByVectorField):
         """Run, handing over every step until `visit` says so; and why it failed, if it did."""
         import torch
 
-        trace, failure = self.make_trace(system, t_span, y0, visit), None
-        trace.most_steps = self.most_steps if most_steps is None else most_steps
+        trace, failure = self.trace(self, system, t_span, y0, visit), None
+        trace.most_steps = self.max_num_steps if most_steps is None else most_steps
         if t_span[0] == t_span[1]:
             return trace, failure
         y: Any = y0 if trace.tensor else torch.from_numpy(np.ascontiguousarray(y0))
@@ -135,14 +205,6 @@ class Watched(ByVectorField):
                     "torch.autograd.grad, or a method of fixed steps, such as 'rk4'."
                 ) from error
         return trace, failure
-
-    @property
-    def most_steps(self) -> int | None:
-        """Most steps of a call, those that are tried and rejected included; None if there is no bound."""
-        return None
-
-    def make_trace(self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array, visit: Visit) -> Trace:
-        raise NotImplementedError
 
     def run(self, problem: Problem) -> Outcome:
         if not readable(problem.y0):
@@ -214,7 +276,7 @@ def run_in_parts(method: Watched, problem: Problem, joint: Outcome, trace: Trace
     reached = np.full(n, trace.reached)
     done, unfinished = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
     counts = {key: joint.stats[key] for key in COUNTS}
-    left = None if method.most_steps is None else method.most_steps - trace.n_tried
+    left = None if method.max_num_steps is None else method.max_num_steps - trace.n_tried
     parts = deque(_divided(problem, np.arange(n), trace))
     while parts:
         part = parts.popleft()
@@ -242,7 +304,7 @@ def run_in_parts(method: Watched, problem: Problem, joint: Outcome, trace: Trace
     if unfinished.any():
         first = np.argmax(unfinished)
         said.append(
-            f"`max_num_steps` = {method.most_steps} steps, in sum over the batch and the parts that it was run in "
+            f"`max_num_steps` = {method.max_num_steps} steps, in sum over the batch and the parts that it was run in "
             f"because some of its trajectories fail, ended before {unfinished.sum()} of {n} trajectories: they are "
             f"kept up to where they were, trajectory {_index(first, batch)} up to t = {reached[first]:.15g}. Raise "
             "`max_num_steps`, or solve those that fail in another call, or end `t_span` before they do."
@@ -298,8 +360,9 @@ class Adaptive(Watched, RungeKutta):
 
     rtol: float = 1e-7
     atol: float = 1e-9
-    max_num_steps: int = 5_000
+    max_num_steps: int = 5_000  # type: ignore[misc]
     tableau: ClassVar[Tableau]
+    trace: ClassVar[type[Trace]] = _Stages
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -324,19 +387,11 @@ class Adaptive(Watched, RungeKutta):
     def output_step(self, problem: Problem) -> float:
         return problem.system.dt
 
-    @property
-    def most_steps(self) -> int:
-        return int(self.max_num_steps)
-
-    def make_trace(self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array, visit: Visit) -> Trace:
-        return _Stages(self, system, t_span, y0, visit)
-
     def integrate(self, trace: Trace, y: Any, length: float) -> None:
         import torch
         from torchdiffeq import odeint
 
         s = torch.tensor([0.0, length], dtype=torch.float64, device=y.device)
-        assert isinstance(trace, _Stages)
         most = trace.most_steps or self.max_num_steps
         options: dict[str, Any] = {"max_num_steps": most}
         if trace.system.shortest_piece < math.inf:
@@ -370,45 +425,6 @@ class Adaptive(Watched, RungeKutta):
             yield np.array([step.t0]), step.y0[None], np.full((1, *y0.shape[:-1]), step.t1 - step.t0)
 
 
-class _Stages(Trace):
-    """Collects the slopes of each step: torchdiffeq interpolates from them."""
-
-    def __init__(self, method: Adaptive, *arguments: Any) -> None:
-        super().__init__(*arguments)
-        self.method, self.tableau = method, method.tableau
-        self.first: Any = None
-        self.slopes: list[Any] = []
-
-    def evaluated(self, y: Any, f: Any) -> None:
-        self.slopes.append(f)
-
-    def callback_step(self, s: Any, y: Any, dt: Any) -> None:
-        """A step is tried. Its first slope is the last of the step before, or at the start that of the state."""
-        self.n_tried += 1
-        self.first = self.slopes[0] if self.first is None else self.first
-        self.slopes.clear()
-
-    def callback_accept_step(self, s: Any, y: Any, dt: Any) -> None:
-        K, y = [self.array(f) for f in (self.first, *self.slopes)], self.array(y)
-        if not differentiable(s, dt):
-            s, dt = float(s), float(dt)
-        t0, t1 = (self.t_span[0] + self.direction * x for x in (s, s + dt))
-        self.first = self.slopes[-1]
-        self.announce(Interpolant(t0, t1, y, lambda: self._inside(t0, t1, y, K)))
-
-    def _inside(self, t0: Any, t1: Any, y: Array, K: list[Array]) -> tuple[list[Array], list[Array]]:
-        """The states and slopes of a step that it is interpolated from."""
-        h, tableau = t1 - t0, self.tableau
-        states, slopes = [y, y + h * weighted(tableau.B, K)], [K[0], K[-1]]
-        if tableau.middle:
-            states.append(y + h * weighted(tableau.middle, K))
-        elif tableau.order > 3:  # of a cubic
-            states += [self.method.step(self.system, t0, y, x * h) for x in THIRDS]
-            slopes += [self.system.vector_field(z, t0 + x * h) for x, z in zip(THIRDS, states[2:], strict=True)]
-            self.evaluations += len(THIRDS) * (len(tableau.B) + 1)
-        return states, slopes
-
-
 @dataclass(frozen=True)
 class Adams(Watched):
     """A multistep method on the grid t0 + k·dt, begun with Runge–Kutta steps; cubic interpolation in between.
@@ -426,6 +442,7 @@ class Adams(Watched):
     dt: float | None = None
     max_order: int = 4
     symplectic: ClassVar[bool] = False
+    trace: ClassVar[type[Trace]] = _Nodes
 
     def __post_init__(self) -> None:
         check_dt(self.dt)
@@ -445,14 +462,10 @@ class Adams(Watched):
         dt = self.step_length(problem.system)
         return Grid(problem.t0, problem.t1, dt).outputs(problem.t_eval, problem.save_every), {"dt": dt}
 
-    def make_trace(self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array, visit: Visit) -> Trace:
-        return _Nodes(self.step_length(system), system, t_span, y0, visit)
-
-    def integrate(self, trace: Trace, y: Any, length: float) -> None:
+    def integrate(self, trace: Any, y: Any, length: float) -> None:
         import torch
         from torchdiffeq import odeint
 
-        assert isinstance(trace, _Nodes)
         nodes = torch.as_tensor(np.abs(np.array(trace.times) - trace.times[0]), device=y.device)
         options = {"grid_constructor": lambda f, y0, t: nodes, "max_order": self.max_order}
         smallest = min(
@@ -469,33 +482,6 @@ class Adams(Watched):
                 warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)
         trace.callback_step(None, None, None)
         trace(nodes[-1], states[-1])
-
-
-class _Nodes(Trace):
-    """Follows the grid: the first slope that is asked for in a step is that at its beginning."""
-
-    def __init__(self, dt: float, system: HamiltonianSystem, t_span: tuple[float, float], *arguments: Any) -> None:
-        super().__init__(system, t_span, *arguments)
-        grid = Grid(*t_span, dt)
-        self.times = [grid.t0 + k * grid.h for k in range(grid.n_steps + bool(grid.remainder))] + [grid.t1]
-        self.before: tuple[Array, Array] | None = None
-        self.begins = False
-
-    def callback_step(self, s: Any, y: Any, dt: Any) -> None:
-        self.begins = True
-
-    def evaluated(self, y: Any, f: Any) -> None:
-        if not self.begins:
-            return
-        self.begins = False
-        if not (y.isfinite().all() and f.isfinite().all()):
-            raise AssertionError("the state is not finite; reduce `dt`")
-        y, f = self.array(y), self.array(f)
-        before, self.before = self.before, (y, f)
-        if before is not None:
-            k = self.n_steps
-            values = (before[0], y), (before[1], f)
-            self.announce(Interpolant(self.times[k], self.times[k + 1], before[0], lambda: values))
 
 
 @cache

@@ -15,7 +15,6 @@ from sympflow.compiler.control import INT, POINTER, Rows, Value
 from sympflow.compiler.functions import added, fma
 from sympflow.compiler.program import gradient, traced
 from sympflow.hamiltonian.formulas import Variable
-from sympflow.hamiltonian.monomials import Monomials
 from sympflow.kernels.runs import Room
 from sympflow.kernels.splittings import Splitting, SplittingCode
 
@@ -126,17 +125,10 @@ def term_code(splitting: Splitting) -> ArrayCode:
 
 
 def function_code(
-    ndof: int,
-    gradient: Any,
-    hessian_vector: Any | None,
-    inverse_mass: np.ndarray | None,
-    driven: bool,
-    friction: int | None,
-    level: int,
-    compensated: bool,
-    monomials: Monomials,
+    ndof: int, gradient: Any, hessian_vector: Any, inverse_mass: Any, driven: bool, friction: int | None, *kick: Any
 ) -> ArrayCode:
-    """The compiled functions of a system that is given by Numba functions, of so many degrees of freedom."""
+    """The compiled functions of a system by Numba functions, for a `kick`: its level, compensated, its monomials."""
+    level, compensated, monomials = kick
     forces = Functions(gradient, hessian_vector if level else None, inverse_mass, driven)
     return ArrayCode(FunctionSplitting(level, monomials, compensated, friction, ndof=ndof, timed=driven), forces)
 

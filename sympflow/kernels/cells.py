@@ -55,14 +55,12 @@ class Cells:
                 low, extent = code.constant(0.0), box[k]
             else:
                 first = code.load(place)
-                low, high = code.loop(
-                    n,
-                    (first, first),
-                    lambda i, ends, place=place: (
-                        _lesser(ends[0], code.load(place, i)),
-                        -_lesser(-ends[1], -code.load(place, i)),
-                    ),
-                )
+
+                def further(i: Value, ends: Sequence[Value], place: Value = place) -> list[Value]:
+                    x = code.load(place, i)
+                    return [_lesser(ends[0], x), -_lesser(-ends[1], -x)]
+
+                low, high = code.loop(n, (first, first), further)
                 extent = high - low
             useful.value = useful.value & (extent < float("inf"))
             count = _whole(_lesser(extent / cutoff, code.constant(FAR)))

@@ -257,13 +257,7 @@ class KeplerCode(Rollouts):
         return [p - q for p, q in zip(a, program(*h, *given), strict=True)]
 
     def _accelerations(
-        self,
-        room: Room,
-        x: list[Vectors],
-        c: list[dict[str, Value]],
-        inverses: Vectors,
-        kick: Value,
-        watch: Callable[[Value, list[Vectors]], Value] | None = None,
+        self, room: Room, x: list[Vectors], c: list[dict[str, Value]], inverses: Vectors, kick: Value, watch: Any = None
     ) -> tuple[list[Vectors], Value]:
         """The accelerations by the interaction, and the length of the kick, which is NaN where planets met."""
         code, groups, zero = room.code, range(self.groups), room.code.constant(0.0, REGISTER)
@@ -481,16 +475,8 @@ def constants(frame: Frame, groups: int) -> tuple[np.ndarray, np.ndarray]:
     table = np.zeros((len(ROWS), groups * LANES))
     m, S = masses[frame.order], frame.sums
     table[:, :] = np.array([0.0, G * S[-1], 0.0, 1.0, 0.0, 0.0, G * masses[0], 0.0])[:, None]
-    table[:, :n] = [
-        G * m,
-        frame.mu[:n],
-        m / S[1:],
-        S[1:] / S[:-1],
-        1 / S[:-1],
-        m,
-        np.full(n, G * masses[0]),
-        m / masses[0],
-    ]
+    heliocentric = np.full(n, G * masses[0]), m / masses[0]
+    table[:, :n] = [G * m, frame.mu[:n], m / S[1:], S[1:] / S[:-1], 1 / S[:-1], m, *heliocentric]
     limits = np.zeros((groups * LANES, groups * LANES))
     i, j = np.triu_indices(n, 1)
     limits[i, j] = limits[j, i] = frame.limits

@@ -59,17 +59,8 @@ class Form:
     even: bool
 
     @classmethod
-    def of(
-        cls,
-        lattice: LatticeHamiltonian,
-        order: Sequence[int],
-        level: int,
-        compensated: bool,
-        damped: bool,
-        width: int,
-        even: bool,
-    ) -> Form:
-        """The form of a lattice whose axes are taken in an order."""
+    def of(cls, lattice: LatticeHamiltonian, order: Sequence[int], *more: Any) -> Form:
+        """The form of a lattice whose axes are taken in an order, and what else code depends on."""
         terms: dict[Any, Any] = {"kinetic": (lattice.T, lattice.p)}
         if lattice.U != 0:
             terms["site"] = lattice.U, lattice.x
@@ -78,7 +69,7 @@ class Form:
         arrays = frozenset(s for s, value in values if isinstance(value, np.ndarray))
         given = tuple(terms.items()), (*lattice.v, *lattice.w), lattice.c, arrays, lattice.inverse_mass is None
         boundary = tuple(lattice.boundary[axis] for axis in order)
-        return cls(*given, boundary, level, compensated, damped, width, even)
+        return cls(*given, boundary, *more)
 
     @property
     def fields(self) -> int:
@@ -852,18 +843,8 @@ class Slabs:
                 x[: found.size] = found.ravel()
             masks = [_mask(x[mine]) for x in (full, follows)]
             offsets = [*[depth, R][: len(outer)], ends[0] * W]
-            numbers = [
-                n_planes,
-                shape[1] if len(order) > 2 else 1,
-                places,
-                vector,
-                plane,
-                row,
-                low,
-                lattice.sites,
-                first * distances[0],
-                *distances,
-            ]
+            numbers = [n_planes, shape[1] if len(order) > 2 else 1, places, vector, plane, row, low]
+            numbers += [lattice.sites, first * distances[0], *distances]
             size = n_planes if outer else int(sizes[mine, -1])
             self._pieces.append(
                 _Piece(numbers, [starts[mine] * strides[-1], sizes[mine], *masks], inside, offsets, own, size)

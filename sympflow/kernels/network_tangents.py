@@ -68,7 +68,7 @@ class NetworkTangents:
     ) -> tuple[np.ndarray, np.ndarray]:
         """ψ̄_t(x) and, if asked for, d/dt ψ̄_t(x), of states (N, 2d) at times (N,), constants being (inputs − d, N)."""
         y = np.empty((2 * self.ndof * (1 + velocity), max(len(t), LANES)))
-        self._run("values", velocity, 1, parameters, t, x, constants, [y])
+        self._run("values", velocity, 1, (parameters, t, x, constants), [y])
         y, dy = y[: 2 * self.ndof, : len(t)], y[2 * self.ndof :, : len(t)]
         return np.ascontiguousarray(y.T), np.ascontiguousarray(dy.T) if velocity else np.empty((0, 0))
 
@@ -97,24 +97,16 @@ class NetworkTangents:
         by = np.zeros(m) if by_velocity is None else np.ascontiguousarray(by_velocity)
         factors = [filled(by_state.transpose(1, 2, 0), LANES), by, self._units, self._places, J, start]
         flags = len(self._places), int(by_start is not None)
-        self._run("jacobian", velocity, 10 * self.ndof, parameters, t, x, constants, factors, *flags)
+        self._run("jacobian", velocity, 10 * self.ndof, (parameters, t, x, constants), factors, *flags)
         if by_start is not None:
             by_start[:] = start[..., :N]
         return J[..., :N]
 
     def _run(
-        self,
-        name: str,
-        velocity: bool,
-        factor: int,
-        parameters: np.ndarray,
-        t: np.ndarray,
-        x: np.ndarray,
-        constants: np.ndarray,
-        rest: Sequence[np.ndarray],
-        *flags: int,
+        self, name: str, velocity: bool, factor: int, given: tuple[Any, ...], rest: Sequence[np.ndarray], *flags: int
     ) -> None:
         """Call a function on all blocks of points, on several threads where it pays."""
+        parameters, t, x, constants = given
         n_layers, n = len(self._is_kick), len(parameters)
         weights = np.zeros((n_layers, self._sizes.size))
         weights[:, self._places] = (parameters * self._units).reshape(n_layers, -1)

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from sympflow.compiler import NotCompiled
 from sympflow.compiler.control import Code, Value
-from sympflow.hamiltonian.formulas import TracedHamiltonian, TracedLetters
+from sympflow.hamiltonian.formulas import MOST_COMPILED, TracedHamiltonian, TracedLetters
 from sympflow.kernels.protocol import Kernel, Run, Steps, Task, run_states
 from sympflow.kernels.rollouts import Columns, Rollouts
 from sympflow.kernels.runs import Numbers, step_function
@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from sympflow.kernels.terms import Terms
 
 __all__ = ["Lettered", "OneStep", "OneStepKernel", "check_size", "is_large", "lettered", "parametric", "terms_of"]
-
-MOST_COMPILED = 5000  # operations of a gradient
 
 
 Lettered = Any

@@ -26,7 +26,7 @@ from sympflow.hamiltonian.formulas import evaluator
 from sympflow.kernels.array_splittings import ARRAYS, ArrayCode, Forces, FunctionSplitting
 from sympflow.kernels.cells import MOST_RANGES, Cells, most_along, most_cells
 from sympflow.kernels.rollouts import aligned, zeros
-from sympflow.kernels.runs import Numbers, Room, begun, finished
+from sympflow.kernels.runs import Numbers, Room, Values, begun, finished
 from sympflow.kernels.splittings import Shape, Splitting, Stage, WithinRange
 from sympflow.kernels.teams import Member, SharedMemory, SharedRollouts, meet
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL
@@ -81,14 +81,7 @@ class PairLaw:
         inverse = np.zeros(local.dim) if local.box is None else 1 / local.box
         return np.array([local.softening**2, end, *box, *inverse, *self.program.table(*local.constants)])
 
-    def met(
-        self,
-        numbers: Sequence[Value],
-        own: Sequence[Value],
-        other: Sequence[Value],
-        columns: Sequence[Value],
-        inside: Value | None = None,
-    ) -> Pair:
+    def met(self, numbers: Values, own: Values, other: Values, columns: Values, inside: Value | None = None) -> Pair:
         """A body with positions, and velocities behind them, and its partners, which are `inside`; 0 for others."""
         code, dim = own[0].code, self.dim
         softening, end, rest = numbers[0], numbers[1], numbers[2 + 2 * dim :]
@@ -156,7 +149,7 @@ def few(local: PairsHamiltonian) -> tuple[Callable[..., Splitting] | None, tuple
     """The splitting of a few bodies, None of more, and the values that it reads."""
     if not local.is_few:
         return None, ()
-    symbols: Any = FewSymbols(local)
+    symbols = FewSymbols(local)
     return partial(FewSplitting, symbols), symbols.values
 
 
@@ -165,7 +158,7 @@ class FewSplitting(Splitting):
 
     @property
     def key(self) -> tuple[Any, ...]:
-        local: Any = self.symbols.local  # type: ignore[union-attr]
+        local = self.symbols.local
         pair = local.V, local.first, local.c, local.cutoff is None, local.box is None
         return *pair, local.n_bodies, local.dim, self.level, self.compensated, self.friction
 
@@ -184,8 +177,7 @@ class FewShape(Shape):
 
     @property
     def _local(self) -> PairsHamiltonian:
-        local: PairsHamiltonian = self.symbols.local  # type: ignore[union-attr]
-        return local
+        return self.symbols.local
 
     def _kicked(self) -> list[Any]:
         return self._moved([self.made.node(p) for p in self.p])
@@ -384,14 +376,8 @@ class PairSums(Forces):
         """Coordinates, velocities along which a sum is taken, columns; in the order of cells, if there are some."""
         code, dim = state.code, self.dim
         size, sites = field(context, "size"), place(context, "sites")
-        x, v, c = (
-            [code.at(first, size * (k + shift)) for k in range(count)]
-            for first, shift, count in (
-                (state, 0, dim),
-                (along, 0, 0 if kind == "gradient" else dim),
-                (sites, 1, self.columns),
-            )
-        )
+        places = (state, 0, dim), (along, 0, 0 if kind == "gradient" else dim), (sites, 1, self.columns)
+        x, v, c = ([code.at(first, size * (k + shift)) for k in range(n)] for first, shift, n in places)
         if self.cells is None:
             return [*x, *v, *c]
         n, order, ready = field(context, "bodies"), place(context, "order"), place(context, "sorted")
@@ -435,14 +421,8 @@ class PairSums(Forces):
                     j = ((first >> SHIFT) + k) << SHIFT
                     number = code.splat(j, LANES) + lanes
                     other = [code.load(row, j, _LANES) for row in rows]
-                    pair = law.met(
-                        numbers,
-                        mine[:moved],
-                        other[:moved],
-                        [*mine[moved:], *other[moved:]],
-                        (bounds[0] < number) & (number < bounds[1]),
-                    )
-                    of_pair = parts(kind, *pair)
+                    columns, inside = [*mine[moved:], *other[moved:]], (bounds[0] < number) & (number < bounds[1])
+                    of_pair = parts(kind, *law.met(numbers, mine[:moved], other[:moved], columns, inside))
                     for axis in range(dim):
                         at = size * axis + j
                         code.store(with_parts(code.load(F, at, _LANES), of_pair, axis, -1.0), F, at)

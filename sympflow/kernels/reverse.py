@@ -73,16 +73,11 @@ class Recorded:
         for first, to in pairwise(self._ends):
             history.append(self._room(n, to) if self._whole else running.copy())
             low, high = self._save.searchsorted((first, to), "right").tolist()
-            chosen, kept = (
-                slice(low if first else 0, high),
-                history[-1] if self._whole else None,
-            )  # with the first state
-            found = np.empty_like(finite) if first else finite
-            states = self.states[i, chosen]
-            code.run(
-                self._table,
-                Batch(self._y0[i], to, self._save[chosen], states, found, first, running, np.zeros(n), stop, kept),
-            )
+            chosen = slice(low if first else 0, high)  # with the first state
+            found, kept = np.empty_like(finite) if first else finite, history[-1] if self._whole else None
+            room = self._save[chosen], self.states[i, chosen], found
+            batch = Batch(self._y0[i], to, *room, first, running, np.zeros(n), stop, kept)
+            code.run(self._table, batch)
             if first:
                 finite[:] = np.where(finite < first, finite, found)
         if self._n_steps == 0:

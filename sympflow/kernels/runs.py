@@ -18,19 +18,9 @@ from sympflow.compiler.control import BOOL, INT, POINTER, Code, Module, Rows, Ty
 from sympflow.compiler.machine import compiled, host
 
 __all__ = [
-    "Lanes",
-    "Memory",
-    "Numbers",
-    "Room",
-    "Values",
-    "begun",
-    "finished",
-    "groups",
-    "map_function",
-    "reverse_function",
-    "run_function",
-    "step_function",
-]
+    "Lanes", "Memory", "Numbers", "Room", "Values", "begun", "finished", "groups", "map_function", "reverse_function",
+    "run_function", "step_function",
+]  # fmt: skip
 
 FAST_MEMORY = 16_384  # bytes of the states of a chunk after the other, and of their ends
 MOST_CHUNKS = 32
@@ -47,6 +37,7 @@ Adjoint = Callable[..., tuple[list[Value], list[Value]]]
 with `slopes` of its numbers, for those of the values after it; with the room, where states are in memory."""
 MemoryStage = Callable[["Room", Numbers, Value, Value], None]
 """The same of a state in memory, which it changes in place."""
+AnyStage = Stage | MemoryStage
 OfValues = Callable[[Sequence[Value], Sequence[Value], Value], Sequence[Value]]
 """``of_values(given, cotangents, kind)``: the cotangents of the values of parameters that are the last numbers given,
 for those of the numbers that a stage reads."""
@@ -59,7 +50,7 @@ def run_function(
     n_values: int,
     n_out: int,
     size: int,
-    stage: Stage | MemoryStage,
+    stage: AnyStage,
     width: int = 1,
     own: bool = False,
     memory: Callable[..., Memory] | None = None,
@@ -241,13 +232,7 @@ def reverse_function(
 
 
 def map_function(
-    n_values: int,
-    n_out: int,
-    size: int,
-    stage: Stage | MemoryStage,
-    width: int = 1,
-    memory: Callable[..., Memory] | None = None,
-    timed: bool = False,
+    n_values: int, n_out: int, size: int, stage: AnyStage, width: int = 1, memory: Any = None, timed: bool = False
 ) -> Callable[..., None]:
     """Compile a map of rows: all columns of one table. If `timed`, stages are given the steps of each lane.
 
@@ -285,7 +270,7 @@ def step_function(
     powers: Sequence[int],
     own: int,
     numbers: Callable[..., Sequence[Any]],
-    stage: Stage | MemoryStage,
+    stage: AnyStage,
     width: int = 1,
     memory: Callable[..., Memory] | None = None,
 ) -> Callable[..., None]:
@@ -626,15 +611,7 @@ class ColumnStage:
     """The stage of a column: all lanes have the same numbers, or each its own, in tables of a length."""
 
     def __init__(
-        self,
-        code: Code,
-        table: Value,
-        kinds: Value,
-        size: int,
-        lanes: int,
-        width: int,
-        stage: Stage | MemoryStage,
-        length: Value | None = None,
+        self, code: Code, table: Value, kinds: Value, size: int, lanes: int, width: int, stage: Any, length: Any = None
     ) -> None:
         self.code, self._table, self._kinds, self._size, self._lanes = code, table, kinds, size, lanes
         self._width, self._stage, self._length = width, stage, length

@@ -36,6 +36,7 @@ def splitting_loops(system: HamiltonianSystem, names: tuple[str, ...] = ()) -> S
     return SplittingLoops(system, names)
 
 
+Array = np.ndarray
 LANES_OF_SUMS, LANES = 16.0, 2.0
 """By how much less a kick takes in a batch than `SplittingLoops.work`: of sums and products alone, and of functions."""
 
@@ -91,7 +92,7 @@ class SplittingLoops:
                 self._has_ranges, self.traced = not self._large, True
                 sums = V is not None and not self._large and V.is_polynomial(*symbols.q)
                 self.abreast = LANES_OF_SUMS if sums else LANES
-        elif isinstance(system.form, TracedHamiltonian):
+        elif isinstance(system.form, TracedHamiltonian) and system.layered is None:
             check_size(system.form)
             check_damping(system, False)
             self._has_force_gradient = self.traced = True
@@ -273,15 +274,8 @@ class SplittingLoops:
         return out
 
     def _damped_rows(
-        self,
-        functions: SplittingRollouts,
-        table: StageTable,
-        x: np.ndarray,
-        h: np.ndarray,
-        y: np.ndarray,
-        t: np.ndarray,
-        varied: bool,
-    ) -> np.ndarray:
+        self, functions: SplittingRollouts, table: StageTable, x: Array, h: Array, y: Array, t: Array, varied: bool
+    ) -> Array:
         """`step_rows` with friction, whose numbers are no polynomials: by one table, or one of its own for each row."""
         alike = len(y) > 0 and not varied and bool((h == h[0]).all() and (t == t[0]).all())
         rows, key = slice(0, 1 if alike else len(y)), (table, x[0], h[0], t[0]) if alike else None
@@ -295,9 +289,7 @@ class SplittingLoops:
         functions.mapped(numbers, y, out)
         return out
 
-    def _damped_table(
-        self, table: StageTable, x: np.ndarray, h: np.ndarray, y: np.ndarray, t: np.ndarray, varied: bool
-    ) -> np.ndarray:
+    def _damped_table(self, table: StageTable, x: Array, h: Array, y: Array, t: Array, varied: bool) -> Array:
         """The numbers of steps with friction, of each stage those of all rows."""
         own, m = table.valued(x, h).damped(self.friction), len(table.drifts)
         values: Sequence[Any] = [*np.tile(y[:, 2 * self.ndof :].T, m)] if varied else self.values

@@ -36,6 +36,7 @@ LANES = 16
 REGISTER = Type("double", LANES)
 ROUNDING = 1e-14  # of rows that are in proportion
 NONE = np.empty(0)
+Form = SymbolicHamiltonian | TracedHamiltonian
 BLOCKS = 2048  # of lanes, some milliseconds, between two looks at the clock
 
 
@@ -46,12 +47,7 @@ class TableLoops:
     """
 
     def __init__(
-        self,
-        symbols: SymbolicHamiltonian | TracedHamiltonian,
-        kicks: Sequence[bool],
-        level: int,
-        monomials: Monomials,
-        friction: Friction,
+        self, symbols: Form, kicks: Sequence[bool], level: int, monomials: Monomials, friction: Friction
     ) -> None:
         self._given = symbols, tuple(kicks), level, monomials, friction
         form, d = symbols.parametric, symbols.ndof
@@ -109,17 +105,9 @@ class LabelErrors:
     are in proportion.
     """
 
-    def __init__(
-        self,
-        loops: TableLoops,
-        x: np.ndarray,
-        t0: np.ndarray | None,
-        y: np.ndarray,
-        scale: np.ndarray,
-        slope: np.ndarray,
-        design: np.ndarray,
-    ) -> None:
-        self._loops, self._count, self._given = loops, x.shape[1], (x, t0, y, scale, slope, design)
+    def __init__(self, loops: TableLoops, *labels: Any) -> None:
+        x, t0, y, scale, slope, design = labels
+        self._loops, self._count, self._given = loops, x.shape[1], labels
         times = len(design)
         leaders, leader, factors = _in_proportion(design.swapaxes(0, 1).reshape(design.shape[1], -1))
         self.matrices = np.ascontiguousarray(design[:, leaders])
@@ -174,11 +162,7 @@ def _in_proportion(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray
 
 
 def table_loops(
-    symbols: SymbolicHamiltonian | TracedHamiltonian,
-    kicks: Sequence[bool],
-    level: int,
-    monomials: Monomials,
-    friction: Friction,
+    symbols: Form, kicks: Sequence[bool], level: int, monomials: Monomials, friction: Friction
 ) -> TableLoops | None:
     """The loops; None of a system that has no compiled form, or one too long."""
     if symbols.samples:
@@ -193,11 +177,7 @@ class _Maps:
     """The kicks and drifts of a system, with what their derivatives need, and the functions that are made of them."""
 
     def __init__(
-        self,
-        form: SymbolicHamiltonian | TracedHamiltonian,
-        level: int,
-        monomials: Monomials,
-        friction: Sequence[Sequence[float]] | None,
+        self, form: Form, level: int, monomials: Monomials, friction: Sequence[Sequence[float]] | None
     ) -> None:
         assert form.inverse_mass is not None
         self.form, self.level, self.monomials, self.friction = form, level, monomials, friction

@@ -241,12 +241,8 @@ class TangentKernel:
         start, (rollout, work) = self._begun(y0, w0), self._rollout(h)
         looks = _looks(save, n_steps, limit)
         some = min(64, max(4, LOOKS // N)) if limit > 0 else len(looks)
-        found = TangentRun(
-            np.full((N, k, len(save) + 1), np.nan),
-            np.full((N, len(save) + 1), np.nan),
-            np.full(N, n_steps),
-            np.ones(N, dtype=bool),
-        )
+        growth, spreads = (np.full((*shape, len(save) + 1), np.nan) for shape in ((N, k), (N,)))
+        found = TangentRun(growth, spreads, np.full(N, n_steps), np.ones(N, dtype=bool))
 
         def follow(looks: np.ndarray, rows: np.ndarray, carry: RunCheckpoint) -> np.ndarray:
             """Follow orbits to the last of some looks, into the rows of `found`, and tell which have ended (n,)."""

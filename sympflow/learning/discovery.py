@@ -31,6 +31,7 @@ from sympflow.learning.shooting import Fit, Problem, chosen_method, minimized
 from sympflow.learning.smoothing import Smooth
 from sympflow.learning.trajectories import POINTS, Trajectories, periods_of
 from sympflow.learning.unseen import remark_on, tube, unseen
+from sympflow.show.cards import cut
 from sympflow.show.style import new_figure
 from sympflow.training.session import Session
 
@@ -256,6 +257,9 @@ class DiscoveredSystem(HamiltonianSystem):
     """A HamiltonianSystem that was found by `discover`; `discovery` is the record of it."""
 
     discovery: Discovery
+
+    def __repr__(self) -> str:
+        return f"{super().__repr__()[:-1]}, H = {cut(str(self.expression))}>"
 
 
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # models that cannot be right diverge

@@ -10,7 +10,7 @@ References
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -26,6 +26,7 @@ from sympflow.integrators.impulses import landings
 from sympflow.integrators.registry import naming_plugin
 from sympflow.integrators.steppers import compiled_loops
 from sympflow.metrics.orbits import OfOrbits, Orbits, checked_orbits, of_many
+from sympflow.show.cards import Card
 from sympflow.show.pictures import curves_figure
 from sympflow.systems.given import GivenSystem, given_system
 
@@ -70,11 +71,16 @@ class Indicator(OfOrbits):
     message: str
     t: np.ndarray = field(repr=False)
     history: np.ndarray = field(repr=False)
+    measure: str = field(default="indicator", repr=False)
+
+    def card(self) -> Card:
+        return replace(super().card(), caption=self.measure)
 
     def drawn(self) -> Figure:
         if len(self.t):
-            return curves_figure(self.t, self.history.reshape(-1, len(self.t)), ("t", "indicator"), self.caption)
-        return of_many("indicator", self.value, "give `t_eval` to see it over time")
+            curves = self.history.reshape(-1, len(self.t))
+            return curves_figure(self.t, curves, ("t", self.measure), self.message)
+        return of_many(self.measure, self.value, "give `t_eval` to see it over time")
 
 
 def lyapunov(
@@ -261,6 +267,9 @@ def checked_threshold(below: float) -> float:
     return value
 
 
+# runs with deviation vectors ----------------------------------------------------------------------
+
+
 @dataclass
 class _Run:
     """Logarithms of lengths (N, k, n + 1), spreads and times (N, n + 1), the last at the end; and the status (N,)."""
@@ -357,7 +366,8 @@ def _compiled(
     spread[..., start:-1], spread[..., -1] = found.spread[..., where], found.spread[..., -1]
     elapsed = np.empty((N, len(times) + 1))
     elapsed[:, :-1], elapsed[:, -1] = counts * grid.h, found.n_steps * grid.h
-    return _Run(growth, spread, elapsed, np.where(found.whole, np.where(found.n_steps < grid.n_steps, 1, 0), -1))
+    status = np.where(found.whole, np.where(found.n_steps < grid.n_steps, 1, 0), -1)
+    return _Run(growth, spread, elapsed, status)
 
 
 def _by_arrays(orbits: Orbits, w0: np.ndarray, scale: np.ndarray, times: np.ndarray, kind: int, below: float) -> _Run:
@@ -365,10 +375,13 @@ def _by_arrays(orbits: Orbits, w0: np.ndarray, scale: np.ndarray, times: np.ndar
     t0, t1 = orbits.t_span
     N, n = len(orbits.rows), len(times)
     sign = 1.0 if t1 >= t0 else -1.0
-    W, exponents = np.broadcast_to(w0.T, (N, *w0.T.shape)).copy(), np.zeros((N, len(w0)))
+    W = np.broadcast_to(w0.T, (N, *w0.T.shape)).copy()
+    exponents = np.zeros((N, len(w0)))
     growth, spread = np.full((N, len(w0), n + 1), np.nan), np.full((N, n + 1), np.nan)
     run = _Run(growth, spread, np.zeros((N, n + 1)), np.zeros(N, dtype=int))
-    position, running, elapsed = np.zeros(N, dtype=int), np.ones(N, dtype=bool), np.zeros(N)
+    position = np.zeros(N, dtype=int)
+    running = np.ones(N, dtype=bool)
+    elapsed = np.zeros(N)
 
     def scaled(vectors: np.ndarray) -> np.ndarray:
         return scale[:, None] * vectors
@@ -393,7 +406,8 @@ def _by_arrays(orbits: Orbits, w0: np.ndarray, scale: np.ndarray, times: np.ndar
         run.status[running & ~finite] = -1
         running &= finite
         W = np.where(running[:, None, None], moved, W)
-        elapsed, lengths = np.where(running, ends, elapsed), np.linalg.norm(scaled(W), axis=1)
+        elapsed = np.where(running, ends, elapsed)
+        lengths = np.linalg.norm(scaled(W), axis=1)
         powers = np.where(running[:, None] & (lengths > 0), np.frexp(lengths)[1], 0)
         W, exponents = np.ldexp(W, -powers[:, None, :]), exponents + powers
         if below > 0:
@@ -462,4 +476,5 @@ def _reported(run: _Run, orbits: Orbits, times: np.ndarray, kind: int, below: fl
 
     t_end = orbits.t_span[0] + run.elapsed[:, -1]
     value, end, status, history = map(shaped, (values[:, -1], t_end, run.status, values[:, :-1]))
-    return Indicator(value, end, status, message, times, np.asarray(history))
+    measure = "Lyapunov exponent" if kind == NONE else "GALI" if kind == VOLUME else "SALI"
+    return Indicator(value, end, status, message, times, np.asarray(history), measure)

@@ -124,7 +124,7 @@ def region_of(outside: Any, system: HamiltonianSystem) -> Outside:
     """The function of states that `outside` means; a ValueError or TypeError if it is none."""
     if outside is None:
         if system.domain is None:
-            raise ValueError(f"`outside` is needed: {system.name!r} has no domain: pass a radius, domain or function.")
+            raise ValueError(f"`outside` is needed: {system.called} has no domain: pass a radius, domain or function.")
         outside = system.domain
     if real_number(outside):
         if not 0 < outside < np.inf:

@@ -15,8 +15,9 @@ from typing import Any
 
 from sympflow.arguments import did_you_mean
 from sympflow.hamiltonian.domain import Ball, Box, EnergySublevel, Tube, domain_from_dict
+from sympflow.hamiltonian.hamiltonian import UNNAMED
 from sympflow.hamiltonian.lattice_states import LatticeStates
-from sympflow.hamiltonian.system import UNNAMED, HamiltonianSystem
+from sympflow.hamiltonian.system import HamiltonianSystem
 
 DOMAINS: dict[str, tuple[str, ...]] = {  # the kinds of domains in a TOML file, and the keys of each
     "Ball": ("center", "radius"),

@@ -402,7 +402,8 @@ def _the_count_of_a_step(integrator: Integrator, system: HamiltonianSystem) -> N
     if integrator.stepper(Problem(system, 0.0, 0.1, y)).counts_itself:
         return
     with np.errstate(all="ignore"):
-        integrator.step(counting_view(system, lambda what, x: made.update([what])), 0.0, y, 0.1)
+        view: Any = counting_view(system, lambda what, x: made.update([what]))
+        integrator.step(view, 0.0, y, 0.1)
     told = integrator.evaluations(0, 0, 1, "numpy")["force_evaluations"]
     n = made["force_evaluations"]
     assert n in (0, told), f"`evaluations` tells {told} forces a step, but step() evaluates {n}"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import inspect
 import math
+import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -18,9 +19,10 @@ from sympflow.arrays import is_tensor
 from sympflow.flow.flow_map import FlowMap
 from sympflow.flow.primed import PrimedFlow
 from sympflow.flow.sympflow import SympFlow
-from sympflow.hamiltonian.domain import Domain, domain_of, remedy_for
+from sympflow.hamiltonian.domain import Domain, Tube, domain_of, remedy_for
 from sympflow.hamiltonian.fingerprint import check_for_flows
 from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.solver import solve
 from sympflow.systems.given import GivenSystem, given_system
 from sympflow.training import checkpoint as checkpoints
 from sympflow.training import fits, trials
@@ -36,6 +38,8 @@ from sympflow.training.split_fit import SplitRun
 from sympflow.training.starts import check_step, default_primed, scaling_of, warn_of_domain
 from sympflow.training.table_fit import MadeRuns, TableRun
 from sympflow.workers import WorkerPool
+
+ORBIT = 1000  # states of an orbit about which a domain is made, a default step apart
 
 DRIVEN = ("primed", "sympflow")  # kinds that are fitted to driven systems
 SHORT_BUDGET = 15.0  # seconds of the least that has trials
@@ -291,8 +295,10 @@ def _domain_for(system: HamiltonianSystem, domain: Domain | None) -> Domain:
     if domain is None and system.local is not None and system.local.has_subsystem and system.y0 is not None:
         domain = system.local_states()
     if domain is None:
+        domain = _around_orbit(system)
+    if domain is None:
         raise ValueError(
-            f"`domain` is not known for the system {system.name!r}: pass the states to train on, as by "
+            f"`domain` is not known for the system {system.called}: pass the states to train on, as by "
             f"domain={remedy_for(system)}."
         )
     if not isinstance(domain, Domain):
@@ -302,6 +308,21 @@ def _domain_for(system: HamiltonianSystem, domain: Domain | None) -> Domain:
     if width != 2 * system.ndof:
         raise ValueError(f"`domain` has states of length {width}, the system {2 * system.ndof}: give [q, p].")
     return domain
+
+
+def _around_orbit(system: HamiltonianSystem) -> Domain | None:
+    """A tube about the orbit of y0, a tenth of its extent wide; None of a system without one, or one that fails."""
+    if system.y0 is None:
+        return None
+    t0, t1 = system.t_span
+    end = t0 + math.copysign(min(abs(t1 - t0), ORBIT * system.dt), t1 - t0)
+    with warnings.catch_warnings(action="ignore"):
+        try:
+            sol = solve(system, t_span=(t0, end), t_eval=np.linspace(t0, end, ORBIT + 1))
+        except (ValueError, TypeError):
+            return None
+    size = np.ptp(sol.y, axis=-1).reshape(2, -1).max(1) / 10
+    return Tube(sol.states, np.repeat(size, system.ndof)) if sol.success and (size > 0).all() else None
 
 
 def _solver_for(fit: Fit, solver: Solver | None) -> Solver:
@@ -375,7 +396,7 @@ def _meant(system: HamiltonianSystem, options: dict[str, Any], searches: bool) -
     if searched and not suitable:
         raise ValueError(
             f"`{searched[0]}` is of the search for primed flows by Gauss–Newton, which needs H = ½ pᵀM⁻¹p + V(q); "
-            f"{system.name!r} is of another form: leave it out for a network, or pass kind='primed', optimizer='bfgs'."
+            f"{system.called} is of another form: leave it out for a network, or pass kind='primed', optimizer='bfgs'."
         )
     if searched or any(name in fits.OF_PRIMED for name in options):
         return "primed"
@@ -392,13 +413,13 @@ def _check_primable(system: HamiltonianSystem, given: list[str], searches: bool)
     needs = f"{named} asks for a flow primed with V and T"
     if not system.separable:
         raise ValueError(
-            f"{needs}, but the system {system.name!r} has one function H, not known as T(p) + V(q): leave out {named} "
+            f"{needs}, but the system {system.called} has one function H, not known as T(p) + V(q): leave out {named} "
             "for a network, or define the system with HamiltonianSystem.from_sympy."
         )
     if not system.quadratic_kinetic and searches:
         raise ValueError(
             f"{needs}, whose table Gauss–Newton fits only where T = ½ pᵀM⁻¹p, as it is not in the system "
-            f"{system.name!r}: leave out {named} for a network, or pass optimizer='bfgs'."
+            f"{system.called}: leave out {named} for a network, or pass optimizer='bfgs'."
         )
 
 

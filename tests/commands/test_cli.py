@@ -476,6 +476,13 @@ ANSWERED = {
     "an end of a driven formula": (["solve", "p**2/2 + q*cos(t)", "--t", "3"], "did you mean --t-end"),
     "a keyword": (["solve", "p^2/2 + lambda*q"], "'lambda', which is a word of Python"),
     "a foreign option": (["solve", "pendulum", "--solver", "verlet"], "did you mean --method"),
+    "a parameter of others": (["solve", "kepler", "--param", "e=0.3"], "`--param` is no option: write --e 0.3"),
+    "an option of a method": (["solve", "kepler", "--rtol", "1e-8"], "behind the name, --method NAME:rtol=1e-8"),
+    "a late start": (
+        ["solve", "pendulum", "--t-start", "200"],
+        "`--t-start` 200 is not before the end, 100: give --t-end",
+    ),
+    "methods as words": (["compare", "pendulum", "--methods", "verlet", "rk45"], "--method rk45, several with commas"),
     "a capital": (["solve", "kepler", "--E", "0.3"], "did you mean --e"),
     "a path of Python": (["solve", "sympflow.systems.pendulum"], "Did you mean 'pendulum'"),
     "no Python": (["solve", "pendulum", "--method", "x"], "All are listed by `sympflow methods`"),
@@ -490,6 +497,10 @@ def test_first_mistakes_are_answered_in_words_of_the_command_line(words, answer)
     assert result.exit_code == 2
     assert re.search(answer, said), said
     assert not re.search(r"sympflow\.[a-z]+\(|HamiltonianSystem|SymPy", said), said
+
+
+def test_a_system_without_flows_is_told():
+    assert "No flow ships for H = " in run("flows", "p**2/2 + q**6").output
 
 
 @pytest.mark.parametrize("y0", ["1,0", "[1, 0]", "1 0"])

@@ -211,7 +211,7 @@ ends.terminal = True
 @pytest.mark.parametrize("what", REFUSED)
 def test_what_takes_no_impulses_says_so(what):
     with pytest.raises(
-        ValueError, match=r"^`system` 'custom' has impulses, DiracDelta in H, .*: .*(solve|store|use|end|give)"
+        ValueError, match=r"^`system` 'H = .*' has impulses, DiracDelta in H, .*: .*(solve|store|use|end|give)"
     ):
         REFUSED[what]()
 

@@ -471,3 +471,27 @@ def test_functions_of_tensors_run_in_inference_mode():
         with torch.inference_mode():
             found = solve(HamiltonianSystem(V, ndof=2), "verlet", (0, 1), y0, dt=0.1).y[:, -1]
         np.testing.assert_allclose(found.numpy(), expected.numpy(), rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("fixed", ["all", "first"])
+def test_layers_whose_weights_are_fixed_are_compiled_whatever_their_width(fixed):
+    net = torch.nn.Sequential(torch.nn.Linear(2, 128), torch.nn.Tanh(), torch.nn.Linear(128, 128), torch.nn.Tanh())
+    net = net.append(torch.nn.Linear(128, 1)).double()
+    (net if fixed == "all" else net[0]).requires_grad_(False)
+    weights = [w for w in net.parameters() if w.requires_grad][:-1]  # the last bias has no force
+    y0 = torch.tensor([0.3, 0.5, -0.2, 0.7], dtype=torch.float64, requires_grad=True)
+    system, (q, p) = HamiltonianSystem(lambda q: net(q)[..., 0], ndof=2), y0.chunk(2)
+    force = torch.func.grad(lambda q: net(q)[..., 0])
+    for _ in range(5):
+        p = p - 0.05 * force(q)
+        q = q + 0.1 * p
+        p = p - 0.05 * force(q)
+    sol = solve(system, "verlet", (0, 0.5), y0, dt=0.1)
+    assert sol.stats["backend"] == "compiled"
+    torch.testing.assert_close(sol.y[:, -1], torch.cat([q, p]), rtol=0, atol=1e-14)
+    found = torch.autograd.grad(sol.y[:, -1].square().sum(), [y0, *weights])
+    expected = torch.autograd.grad(torch.cat([q, p]).square().sum(), [y0, *weights])
+    for a, b in zip(found, expected, strict=True):
+        torch.testing.assert_close(a, b, rtol=0, atol=1e-13)
+    other = solve(system, "gauss_legendre4", (0, 0.5), y0.detach().numpy(), dt=0.1)  # by arrays
+    np.testing.assert_allclose(other.y[:, -1], sol.y[:, -1].detach(), atol=0.01)

@@ -304,7 +304,7 @@ def test_schemes_and_systems_without_a_clock_are_refused():
     with pytest.raises(ValueError, match=r"^`terms` must be a positive integer"):
         ClockedFlow(3, terms=0)
     with pytest.raises(ValueError, match=r"^`domain` is not known for the system 'plain'"):
-        train(HamiltonianSystem.from_sympy("p**2/2 - 1/sqrt(1 + q**2)", y0=[1, 0], name="plain"), ClockedFit(0.1))
+        train(HamiltonianSystem.from_sympy("p**2/2 - 1/sqrt(1 + q**2)", name="plain"), ClockedFit(0.1))
 
 
 def test_a_flow_in_another_time_is_asked_for_by_name_or_by_a_tolerance_that_no_other_meets():

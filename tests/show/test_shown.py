@@ -134,10 +134,32 @@ def test_a_system_of_a_file_is_called_by_its_file(tmp_path):
     assert orbits(system).plot().get_suptitle().startswith("own.py:morse")
 
 
-@pytest.mark.parametrize(("dt", "joined"), [(0.1, True), (1.0, False)])
+@pytest.mark.parametrize(("dt", "joined"), [(0.1, True), (1.0, True), (2.5, False)])
 def test_curves_are_joined_where_they_are_known_between_points(dt, joined):
     line = sympflow.solve("harmonic-oscillator", "kahan_li8", (0, 30), dt=dt).plot("phase")
     assert (line.axes[0].lines[0].get_linestyle() == "-") == joined
+
+
+@pytest.mark.parametrize("span", [(0, 30), (30, 0)])
+def test_a_flow_of_few_outputs_is_drawn_as_a_curve(span):
+    """Between outputs too the curve is the solution, to a fiftieth of its extent."""
+    line = sympflow.solve("pendulum", "sympflow", span, dt=1.0).plot("orbit").axes[0].lines[0]
+    t, q = line.get_data()
+    exact = sympflow.solve("pendulum", "kahan_li8", span, dt=0.05, t_eval=t).y[0]
+    assert len(t) > 300
+    assert np.abs(q - exact).max() < 0.02 * np.ptp(exact)
+
+
+@pytest.mark.parametrize(("system", "bodies"), [("solar-system", 9), ("lennard-jones", 7)])
+def test_all_bodies_are_drawn(system, bodies):
+    orbit, phase = sympflow.solve(system, t_span=(0, 0.01)).plot(["orbit", "phase"]).axes
+    assert [text.get_text() for text in orbit.get_legend().texts] == [str(i) for i in range(bodies)]
+    assert len(phase.lines) == bodies
+
+
+def test_the_states_of_an_ensemble_have_a_time():
+    found = sympflow.ensemble("pendulum", "verlet", (0, 2), [[1.0, 0.0], [0.5, 0.0]], t_eval=[1.0, 1.5])
+    assert found.plot().get_suptitle() == "pendulum, t = 1.5"
 
 
 def test_one_output_is_a_point():
