@@ -190,6 +190,11 @@ ANSWERED = {
         ValueError,
         r"for 'H = p1\*\*2/2 \+ q1\*\*2/2', \[q, p\] with 1 each",
     ),
+    "a flow without its system": (
+        lambda: sympflow.shipped_flows("pendulum")[0].load().plot(),
+        ValueError,
+        "`system` is needed, whose H bounds the domain .*load the flow with it",
+    ),
     "f.pt": (lambda: sympflow.shipped_flows("pendulum")[0].load().save("f.pt"), ValueError, "call it f.safetensors"),
     "a list of elements": (
         lambda: HamiltonianSystem.planets([1, 0.1], elements=[{"a": 1}]),
