@@ -56,6 +56,10 @@ class Trajectories(Shown):
     names: tuple[str, ...]
     velocities: bool = False
 
+    def __post_init__(self) -> None:
+        if not all(isinstance(run, Run) for run in self.runs):
+            raise TypeError("`runs` are made from data by Trajectories.read, as in Trajectories.read((t, y)).")
+
     @classmethod
     def read(
         cls,

@@ -161,6 +161,10 @@ __all__ += ["perihelion_angle"]
 __all__ += [factory.__name__ for factory in SYSTEMS.values()]
 
 
+def __dir__() -> list[str]:
+    return sorted(__all__)
+
+
 for _key_of, _factory in SYSTEMS.items():
     SYSTEMS[_key_of] = globals()[_factory.__name__] = told(_factory)
     SYSTEMS[_key_of].__module__ = __name__  # where pickles find it
