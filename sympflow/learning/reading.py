@@ -55,8 +55,6 @@ class Run:
         return Run(self.t[start:stop], np.ascontiguousarray(self.y[:, start:stop]))
 
 
-# the kinds of data ----------------------------------------------------------------------------------------------------
-
 Found = tuple[str, np.ndarray, np.ndarray]
 """The name of a trajectory for messages, its times and states, not checked yet."""
 
@@ -145,8 +143,7 @@ def _of_pair(t: Any, y: Any) -> Iterator[Found]:
 
 
 def _of_ends(x: Any, t: Any, y: Any) -> Iterator[Found]:
-    x, y = _numbers(x, "states"), _numbers(y, "states")
-    t = _numbers(t, "times")
+    x, y, t = _numbers(x, "states"), _numbers(y, "states"), _numbers(t, "times")
     t = t[:, 0] if t.ndim == 2 and t.shape[1] == 1 else t
     if x.shape != y.shape or t.shape not in ((), (1,), (len(x),)):
         raise ValueError(
@@ -396,9 +393,6 @@ def _numbered(columns: list[str], letter: str) -> list[str]:
     found = [(c, re.fullmatch(form, c.lower())) for c in columns]
     numbers = {int("".join(m.groups("")) or 1): c for c, m in found if m}
     return [numbers[i] for i in range(1, len(numbers) + 1)] if sorted(numbers) == [*range(1, len(numbers) + 1)] else []
-
-
-# checks ---------------------------------------------------------------------------------------------------------------
 
 
 def width_of(found: list[Found], ndof: int | None) -> int:

@@ -127,8 +127,7 @@ def _linear_flow(system: HamiltonianSystem, t: np.ndarray, y0: np.ndarray) -> np
         return None
     import sympy
 
-    variables = [*system.written.q, *system.written.p]
-    H = system.written.H
+    variables, H = [*system.written.q, *system.written.p], system.written.H
     if not H.is_polynomial(*variables) or any(sum(m) not in (0, 2) for m in sympy.Poly(H, *variables).monoms()):
         return None
     S = np.asarray(system.hessian(np.zeros(len(variables))))

@@ -200,8 +200,7 @@ class TestNumbersOfH:
 
     @pytest.mark.parametrize("method", ["verlet", "gauss_legendre4"])
     def test_their_derivatives(self, method):
-        k = torch.tensor(1.3, dtype=torch.float64)
-        h = 1e-6
+        k, h = torch.tensor(1.3, dtype=torch.float64), 1e-6
         slope = (self.end(k + h, method) - self.end(k - h, method)) / (2 * h)
         assert slope.abs().min() > 0.1
         for found in (
@@ -411,8 +410,7 @@ class TestBatchesUnderVmap:
         assert seen[1].status == 0
 
     def test_a_batch_within_a_lane(self):
-        batch = torch.stack([Y, 0.5 * Y])
-        f = problem("gauss_legendre4")[1]
+        batch, f = torch.stack([Y, 0.5 * Y]), problem("gauss_legendre4")[1]
         torch.testing.assert_close(vmap(f)(batch), torch.stack([f(y) for y in batch]), **CLOSE)
 
     def test_y0_must_be_finite_in_every_lane(self):
