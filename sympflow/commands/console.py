@@ -70,8 +70,9 @@ def in_options(message: str, context: typer.Context) -> str:
         option = next((options[other] for other in others if other in options), None)
         if option is not None:
             options.setdefault(name, option)
+    method = str(context.params.get("method_name") or "NAME").split(":")[0]
     for name in OF_METHODS if "method" in options else ():
-        options.setdefault(name, f"NAME:{name}=")
+        options.setdefault(name, f"{method}:{name}=")
     message = re.sub(r"`(\w+)`", lambda m: f"`{options.get(m[1], m[1])}`", in_words(message)).replace("=`", "=…`")
     given = re.compile(r"`?(?<![\w:.-])(?P<name>\w+)=(?P<value>'[^']*'|\"[^\"]*\"|True|[\d.eE+-]*\d|(?=\W|$))`?")
 

@@ -25,6 +25,7 @@ def solve(
     y0: State = None,
     dt: Step = None,
     tol: Annotated[Number, Option(help="Choose the step, or the shipped flow, for this relative energy error.")] = None,
+    tol_of: Annotated[Text, Option(help="What --tol is the error of: energy or state. Default: energy.")] = None,
     n_outputs: Annotated[Count, Option(help="Number of equal intervals between outputs. Default: every step.")] = None,
     save_every: Annotated[Count, Option(help="Only every so many-th step is an output.")] = None,
     backend: words.Backend = "auto",
@@ -68,7 +69,7 @@ def solve(
         span = words.interval(scene, t_start, t_end)
         times = None if n_outputs is None else _instants(*span, n_outputs)
         ready_file(to)
-        options = asked(ctx, "dt tol save_every store checkpoint_every backend resume")
+        options = asked(ctx, "dt tol tol_of save_every store checkpoint_every backend resume")
         options["progress"] = progress and not quiet
         sol = solve_system(scene.system, chosen, span, words.state(y0), t_eval=times, **options)
         if to is not None:

@@ -207,7 +207,7 @@ def section(
     orbits: Annotated[Count, Option(help="Instead: so many initial states drawn from the domain.")] = None,
     seed: Annotated[int, Option(help="Of the states that are drawn.")] = 0,
     dt: Step = None,
-    tol: Annotated[Number, Option(help="Take the cheapest shipped flow with so small a relative energy error.")] = None,
+    tol: Annotated[Number, Option(help="Choose the step, or a flow, with so small a relative energy error.")] = None,
     coordinate: Annotated[Text, Option(help="The plane's constant coordinate: q1, p2. Default: the first.")] = None,
     level: Annotated[Number, Option(help="Its value there. Default: 0.")] = None,
     direction: Annotated[

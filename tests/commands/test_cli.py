@@ -467,7 +467,7 @@ def test_the_command_line_writes_utf_8(locale, tmp_path):
 ANSWERED = {
     "an option twice": (["solve", "pendulum", "--dt", "1", "--dt", "2"], "given 2 times: give it once"),
     "methods twice": (["compare", "pendulum", "--method", "rk4", "--method", "rk45"], "its values separated by"),
-    "tolerance of rk45": (["solve", "pendulum", "--method", "rk45", "--tol", "1e-6"], "`NAME:rtol=1e-06`"),
+    "tolerance of rk45": (["solve", "pendulum", "--method", "rk45", "--tol", "1e-6"], "`rk45:rtol=1e-06`"),
     "a method as a system": (["solve", "pendulum", "verlet"], "give it as --method verlet"),
     "a parameter without --": (["solve", "harmonic-oscillator", "omega=3"], "as --omega 3"),
     "an equation": (["solve", "H = p**2/2"], "right side alone, without H ="),
