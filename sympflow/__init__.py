@@ -163,6 +163,12 @@ _OF_INTEROP = {"as_scipy": "scipy", "from_hamiltonian": "systems", "from_module"
     ("odeint", "odeint_adjoint", "odeint_dense", "odeint_event"), "torchdiffeq"
 )
 
+_ELSEWHERE = {
+    **dict.fromkeys(("plot", "plotting", "visualization"), "plots are methods of results, such as solve(…).plot()"),
+    **dict.fromkeys(("chaos", "analysis"), "take lyapunov, sali, frequencies or poincare_section, all in `sympflow`"),
+    **dict.fromkeys(("methods", "solvers"), "take available(), which lists them, or get(name)"),
+}
+
 
 def __getattr__(name: str) -> Any:
     if name in (*_MODULES, *_ROOMS):
@@ -174,6 +180,8 @@ def __getattr__(name: str) -> Any:
         hint = f". Did you mean {close[0]!r}?" if close else ""
         if not name.startswith("_") and name in whole_import("sympflow.systems").__all__:
             hint = f". It is `sympflow.systems.{name}`"
+        if name in _ELSEWHERE:
+            hint = f": {_ELSEWHERE[name]}"
         if name in _OF_INTEROP:
             hint = f". It is `sympflow.interop.{_OF_INTEROP[name]}.{name}`"
         raise AttributeError(f"module 'sympflow' has no attribute {name!r}{hint}")

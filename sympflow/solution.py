@@ -13,7 +13,6 @@ import numpy as np
 
 from sympflow.arguments import check_flag, told, warn
 from sympflow.arrays import Array, concatenate, is_tensor, to_numpy
-from sympflow.hamiltonian.bodies import PairsHamiltonian
 from sympflow.hamiltonian.scales import known_scale, size_of_terms, weights
 from sympflow.integrators.contract import method_text
 from sympflow.integrators.interpolants import Mapped
@@ -254,6 +253,8 @@ class Solution(Answering):
             Of "orbit", q₁ against q₂ (q over t of one degree of freedom, a map of all q of many), "phase", q₁ against
             p₁, of bodies their orbits and x against pₓ/m, and "energy", which is left out where energy is not kept.
         """
+        from sympflow.hamiltonian.bodies import PairsHamiltonian
+
         shown = self if self.system.shows_energy is self.system.keeps_energy else self.physical()
         y, kinds = to_numpy(shown.y), (kinds,) if isinstance(kinds, str) else kinds
         error = None

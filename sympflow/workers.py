@@ -17,16 +17,7 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import (
-    FIRST_COMPLETED,
-    BrokenExecutor,
-    CancelledError,
-    Executor,
-    Future,
-    ProcessPoolExecutor,
-    ThreadPoolExecutor,
-    wait,
-)
+from concurrent import futures
 from dataclasses import dataclass
 from functools import cache, lru_cache, partial
 from importlib.metadata import PackageNotFoundError, version
@@ -72,9 +63,6 @@ def checked_workers(workers: Any) -> Any:
             f"as map; got {workers!r}. Pass a number such as 2, or make an instance."
         )
     return workers
-
-
-# what is sent --------------------------------------------------------------------------------------------------------
 
 
 @cache
@@ -148,9 +136,6 @@ def _unpacked(packed: bytes) -> Any:
             "Install the same versions everywhere."
         )
     return pickle.loads(value)
-
-
-# the calls -----------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -228,7 +213,7 @@ def mapped(
                     "may have ended them for the memory that they took: take a smaller `chunk`, or fewer workers. "
                     "A script that starts processes needs `if __name__ == '__main__':` around what it runs."
                 ) from loss.__cause__
-            if isinstance(workers, Executor) and not done:  # broken for good
+            if isinstance(workers, futures.Executor) and not done:  # broken for good
                 n = getattr(workers, "_max_workers", None) or available_cores()
                 warnings.warn(
                     f"`workers` is an executor of which a process died, so that it takes no more work: the rest is "
@@ -244,7 +229,7 @@ class WorkerPool:
 
     def __init__(self, workers: Any = 1) -> None:
         self.workers = checked_workers(workers)
-        self._pool: ProcessPoolExecutor | None = None
+        self._pool: futures.ProcessPoolExecutor | None = None
 
     @property
     def alone(self) -> bool:
@@ -258,7 +243,7 @@ class WorkerPool:
         workers = self.workers
         if isinstance(workers, int) and workers > 1 and len(items) > 1:
             if self._pool is None:
-                self._pool = ProcessPoolExecutor(workers, _context(), _leave_interrupts)
+                self._pool = futures.ProcessPoolExecutor(workers, _context(), _leave_interrupts)
             workers = self._pool
         early: dict[int, Any] = {}
         following = 0
@@ -288,15 +273,15 @@ def _leave_interrupts() -> None:
 def _rounds(workers: Any, call: _Call, processes: bool, clock: _Clock) -> Callable[[list[Numbered]], Iterable[Answer]]:
     """Return the function that gives the answers of numbered items, as they come, by such workers."""
     if not isinstance(workers, int):
-        if isinstance(workers, ProcessPoolExecutor):
+        if isinstance(workers, futures.ProcessPoolExecutor):
             call.common.pack()
         return partial(_by_map, workers, call, clock)
     if workers == 1:
         return partial(map, call)
     if not processes:
-        return partial(_in_pool, partial(ThreadPoolExecutor, workers), call, 2 * workers, clock)
+        return partial(_in_pool, partial(futures.ThreadPoolExecutor, workers), call, 2 * workers, clock)
     call.common.pack()
-    return partial(_in_pool, partial(ProcessPoolExecutor, workers, _context()), call, 2 * workers, clock)
+    return partial(_in_pool, partial(futures.ProcessPoolExecutor, workers, _context()), call, 2 * workers, clock)
 
 
 class _Lost(Exception):
@@ -304,7 +289,8 @@ class _Lost(Exception):
 
 
 def _is_loss(error: BaseException) -> bool:
-    return isinstance(error, BrokenExecutor | CancelledError) or any(c.__name__ in LOST for c in type(error).__mro__)
+    lost = isinstance(error, futures.BrokenExecutor | futures.CancelledError)
+    return lost or any(c.__name__ in LOST for c in type(error).__mro__)
 
 
 def _context() -> Any:
@@ -313,12 +299,12 @@ def _context() -> Any:
 
 
 def _in_pool(
-    make: Callable[[], Executor], call: _Call, most: int, clock: _Clock, todo: list[Numbered]
+    make: Callable[[], futures.Executor], call: _Call, most: int, clock: _Clock, todo: list[Numbered]
 ) -> Iterator[Answer]:
     """Answers as they come, from a pool that is closed afterwards; never more than `most` calls are under way."""
     pool = make()
     waiting = iter(todo)
-    under_way: set[Future[Answer]] = set()
+    under_way: set[futures.Future[Answer]] = set()
     try:
         while True:
             for numbered in waiting:
@@ -327,23 +313,23 @@ def _in_pool(
                     break
             if not under_way:
                 break
-            ready, under_way = wait(under_way, clock.left(), return_when=FIRST_COMPLETED)
+            ready, under_way = futures.wait(under_way, clock.left(), return_when=futures.FIRST_COMPLETED)
             if not ready:
                 raise TimeoutError
             lost = None
             for future in ready:
                 try:
                     answer = future.result()
-                except BrokenExecutor as error:
+                except futures.BrokenExecutor as error:
                     lost = error
                     continue
                 yield answer
             if lost is not None:
                 raise _Lost(str(lost)) from lost
-    except BrokenExecutor as error:
+    except futures.BrokenExecutor as error:
         raise _Lost(str(error)) from error
     finally:
-        pool.shutdown(wait=isinstance(pool, ThreadPoolExecutor), cancel_futures=True)
+        pool.shutdown(wait=isinstance(pool, futures.ThreadPoolExecutor), cancel_futures=True)
 
 
 def _by_map(workers: Any, call: _Call, clock: _Clock, todo: list[Numbered]) -> Iterator[Answer]:
@@ -396,7 +382,7 @@ def _map_of(workers: Any, clock: _Clock) -> Callable[[_Call, list[Numbered]], It
     pools = sys.modules.get("multiprocessing.pool")
     if pools is not None and isinstance(workers, pools.Pool) and not isinstance(workers, pools.ThreadPool):
         return lambda call, todo: _watched(workers, call, todo)
-    if isinstance(workers, Executor) and (left := clock.left()) is not None:
+    if isinstance(workers, futures.Executor) and (left := clock.left()) is not None:
         return partial(workers.map, timeout=left)
     return getattr(workers, "map", workers)
 

@@ -280,7 +280,7 @@ def test_integrators_that_look_for_no_events_are_searched_afterwards(t_end):
     run = {"system": OSCILLATOR, "method": Unwatched(), "t_span": (0, t_end), "y0": START}
     sol = solve(events=event(zero_q), **run)
     np.testing.assert_allclose(sol.t_events[0], zeros, atol=1e-3)
-    assert (sol.status, bool(sol.sol), sol.t[-1], len(sol.t)) == (0, False, t_end, 17)
+    assert (sol.status, sol.sol, sol.t[-1], len(sol.t)) == (0, None, t_end, 17)
     ends = solve(events=event(zero_q, terminal=2), dense_output=True, **run)
     np.testing.assert_allclose(ends.t_events[0], zeros[:2], atol=1e-3)
     assert (ends.status, ends.t[-1]) == (1, ends.t_events[0][-1])

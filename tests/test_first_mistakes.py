@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import sympy as sp
 from scipy.special import ellipk
+from sympy import cos
 from sympy.physics.mechanics import dynamicsymbols
 
 import sympflow
@@ -77,6 +78,10 @@ def test_coordinates_have_any_names(expression, q, p):
 def test_functions_of_the_time_are_coordinates():
     r, pr = dynamicsymbols("r p_r")
     assert H(pr**2 / 2 + k / r, q=[r], p=[pr], params={k: 2}).expression == H("p**2/2 + 2/q").expression
+    theta = dynamicsymbols("theta")
+    assert (
+        H(theta.diff() ** 2 / 2 - cos(theta), q=[theta], p=[theta.diff()]).expression == H("p**2/2 - cos(q)").expression
+    )
 
 
 def ran():
@@ -115,7 +120,7 @@ ANSWERED = {
     "keyword": (lambda: H("p**2/2 + lambda*q"), ValueError, "lambda is a word of Python"),
     "2q": (lambda: H("p**2/2 + 2q"), ValueError, r"2q lacks a sign: write 2\*q"),
     "²": (lambda: H("p²/2"), ValueError, r"² is not understood: write q\*\*2"),
-    "dimension": (lambda: HamiltonianSystem(lambda q: q**2, dimension=1), TypeError, "of a function are `ndof`"),
+    "dimension": (lambda: HamiltonianSystem(lambda q: q**2, dimension=1), TypeError, "are `ndof` of functions"),
     "H =": (lambda: H("H(q, p) = p**2/2"), ValueError, r"leave 'H\(q, p\) =' out"),
     "t_end": (lambda: solve("pendulum", "verlet", t_end=1), TypeError, r"times are `t_span`, \(start, end\)"),
     "n_steps": (lambda: solve("pendulum", "verlet", n_steps=10), TypeError, r"dt=\(t1 - t0\)/n"),
@@ -143,6 +148,28 @@ ANSWERED = {
     "an event of y": (lambda: solve(SPRING, y0=[1, 0], events=lambda y: y), TypeError, r"Write g\(t, y\)"),
     "Tsit5": (lambda: sympflow.get("Tsit5"), ValueError, "'dop853'"),
     "symplectic": (lambda: sympflow.get("symplectic"), ValueError, "'srkn11b', or 'kahan_li8'"),
+    "a coordinate of nothing": (
+        lambda: H("px**2/2 + x**2/2", q=["x", "y"], p=["px", "py"]),
+        ValueError,
+        "`q` and `p` name 'y' and 'py', on which H does not depend",
+    ),
+    "q alone": (lambda: H("px**2/2 + x**2/2", q=["x"]), ValueError, r"as in q=\['x', 'y'\], p=\['px', 'py'\]"),
+    "RK23": (lambda: sympflow.get("RK23"), ValueError, "'rk45'"),
+    "mercurius": (lambda: sympflow.get("mercurius"), ValueError, "'dop853' with `rtol`"),
+    "y0 turned": (lambda: solve("pendulum", y0=np.ones((2, 5))), ValueError, r"got \(2, 5\). Transpose it"),
+    "sympflow.plotting": (lambda: sympflow.plotting, AttributeError, "plots are methods of results"),
+    "sympflow.chaos": (lambda: sympflow.chaos, AttributeError, "take lyapunov, sali"),
+    "a function as text": (
+        lambda: H(len),
+        ValueError,
+        r"of a function make HamiltonianSystem\(hamiltonian=f, ndof=d\)",
+    ),
+    "no ndof": (lambda: HamiltonianSystem(len), ValueError, r"as in HamiltonianSystem\(V, ndof=2\)"),
+    "Trajectories(t, y)": (
+        lambda: sympflow.Trajectories(ran().t, ran().y),
+        TypeError,
+        r"Trajectories.read\(\(t, y\)\)",
+    ),
     "sol[0]": (lambda: ran()[0], TypeError, r"`sol` has no item 0: take `sol.t`, `sol.y`"),
     "t, y = sol": (lambda: list(ran()), TypeError, r"as in t, y = sol.t, sol.y"),
     "sol.q1": (lambda: ran().q1, AttributeError, r"'q1': take `q\[..., i, :\]`"),
@@ -189,6 +216,11 @@ ANSWERED = {
         lambda: solve(SPRING, y0=[1, 0, 0]),
         ValueError,
         r"for 'H = p1\*\*2/2 \+ q1\*\*2/2', \[q, p\] with 1 each",
+    ),
+    "a flow without its system": (
+        lambda: sympflow.shipped_flows("pendulum")[0].load().plot(),
+        ValueError,
+        "`system` is needed, whose H bounds the domain .*load the flow with it",
     ),
     "f.pt": (lambda: sympflow.shipped_flows("pendulum")[0].load().save("f.pt"), ValueError, "call it f.safetensors"),
     "a list of elements": (

@@ -558,11 +558,12 @@ def test_blow_up_is_reported(method):
     t_star = 5.450984210235402
     loose = {"rtol": 1e-4, "atol": 1e-6} if method in ("bosh3", "fehlberg2", "adaptive_heun") else {}
     got = caught(lambda: solve(ESCAPE, method, (0, 20), backend="auto" if method in KINDS else "array", **loose))
+    if get(method).trained:
+        assert isinstance(got, RuntimeWarning)
+        assert "The state left the domain of the flow at t = 0" in str(got)
+        return
     assert not isinstance(got, Exception), got
     assert np.isfinite(got.y).all()
-    if get(method).trained:
-        assert "The state left the domain at t = 0" in got.message
-        return
     assert got.status == -1
     with pytest.raises(RuntimeError, match="t = "):
         got.raise_for_status()

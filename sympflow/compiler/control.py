@@ -506,11 +506,7 @@ class Code:
         return [x.value for x in variables]
 
     def when(
-        self,
-        condition: Value,
-        then: Callable[[], Sequence[Value]],
-        otherwise: Callable[[], Sequence[Value]] = tuple,
-        rare: bool = False,
+        self, condition: Value, then: Callable[[], Any], otherwise: Callable[[], Any] = tuple, rare: bool = False
     ) -> list[Value]:
         """Execute one of two bodies, and return its values; `rare` if the first one hardly ever."""
         yes, no, after, before = self._label(), self._label(), self._label(), self._block

@@ -98,10 +98,8 @@ class Chunk:
 
     def windows(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """The states along the orbits, in bounded memory: times (m,) and states (n, 2d, m), window by window."""
-        times = self.times
-        stepper = self._stepper
-        most = max(1, MOST_VALUES // self.y0.size)
-        alike = self.t_eval is None and not self.params
+        times, stepper = self.times, self._stepper
+        most, alike = max(1, MOST_VALUES // self.y0.size), self.t_eval is None and not self.params
         kernel = None if stepper is None else stepper.kernel
         if len(times) <= most or not alike or stepper is None or kernel is None or len(self) == 1:
             yield times, self.states(times)

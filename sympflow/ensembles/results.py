@@ -76,9 +76,6 @@ class Done:
     messages: dict[int, str]
 
 
-# variables -----------------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class Variable:
     """An array of a Dataset or a store: a field of each orbit, or some rows of it."""

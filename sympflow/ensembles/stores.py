@@ -35,9 +35,6 @@ MESSAGES = "messages"
 KNOWN = "sympflow_ensemble"  # the attribute that says of which ensemble a store is
 
 
-# what an ensemble is known by ----------------------------------------------------------------------------------------
-
-
 def identity(
     system: HamiltonianSystem,
     integrator: Integrator,
@@ -56,9 +53,6 @@ def identity(
     known.add("params", ", ".join(f"{len(v)} values of {name}" for name, v in axes.items()) or "none", axes)
     known.add("reduce", type(reduction).__name__, reduction)
     return known
-
-
-# the store -----------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

@@ -141,8 +141,7 @@ def ensemble(
     check_flag("same", same)
     if (resume or same) and store is None:
         raise ValueError(f"`{'resume' if resume else 'same'}` goes on with a `store`: name one.")
-    kept = reduction(reduce)
-    orbits = initial_states(system, y0, n, seed)
+    kept, orbits = reduction(reduce), initial_states(system, y0, n, seed)
     fixed, axes = _axes(system, params)
     first = orbits.states(0, min(len(orbits), SHORTEST_CHUNK))
     integrator = integrator_for(system, method, options, (t0, t1), first, flows=not (fixed or axes))
@@ -264,13 +263,9 @@ def _runs_together(
     return rows.parameter_values is not None and integrator.takes_parameter_values(problem)
 
 
-# chunks --------------------------------------------------------------------------------------------------------------
-
-
 def _chunk_shape(layout: Layout, problem: Chunk, chunk: int | None, in_memory: bool, multiple: int) -> tuple[int, ...]:
     """The shape of a chunk; a ValueError says how large an ensemble is that does not fit."""
-    size = sum(math.prod(s) for s, _ in layout.fields.values())
-    total = math.prod(layout.shape)
+    size, total = sum(math.prod(s) for s, _ in layout.fields.values()), math.prod(layout.shape)
     grid = f"{' × '.join(f'{n:,}' for n in layout.shape)} orbits"
     if in_memory and total * size > MAX_ASKED_VALUES:
         raise ValueError(

@@ -22,6 +22,7 @@ from sympflow.flow.files import write
 from sympflow.flow.known import KnownFlow
 from sympflow.flow.records import MAX_DT, MIN_DT, Provenance
 from sympflow.flow.weights import checksum
+from sympflow.hamiltonian.domain import EnergySublevel
 from sympflow.hamiltonian.doubling import doubled
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.show.cards import Card, Shown
@@ -556,6 +557,10 @@ class FlowMap(KnownFlow, Shown, nn.Module):
         domain = self.domain if system is None else self.domain_for(system) or system.domain
         if domain is None and (system is None or system.y0 is None):
             raise ValueError("`system` is needed, for the flow has no domain to start in: pass one with a `y0`.")
+        if isinstance(domain, EnergySublevel) and domain.hamiltonian is None:
+            raise ValueError(
+                "`system` is needed, whose H bounds the domain of the flow: pass it, or load the flow with it."
+            )
         y0 = np.atleast_2d(system.y0) if domain is None else domain.sample(DRAWN, 0)  # type: ignore[union-attr, arg-type]
         states = [torch.as_tensor(y0, dtype=self.dtype, device=self.device)]
         with torch.no_grad():

@@ -88,6 +88,7 @@ class CallableHamiltonian(Definition):
         self._potential, self._hamiltonian, self._gradient, self._hessian_vector = of_arrays
         self.given_functions = self.numba_functions is None
 
+    @np.errstate(all="ignore")
     def as_sum(self) -> tuple[CallableHamiltonian, np.ndarray | None, bool] | None:
         """The definition of H = T(p) + V(q) by V, M⁻¹, and whether T = ½ pᵀM⁻¹p; None of an H that is no such sum."""
         form, d = self.form, self.ndof
@@ -97,18 +98,19 @@ class CallableHamiltonian(Definition):
         slopes = gradient(H.outputs[0], inputs[-d:])
         if {x.order for x in inputs[:-d]} & {x.order for x in reached(slopes)}:
             return None
-        made = CallableHamiltonian(d, _AtRest(self._functions[1]), None, None, None, self.given, self.timed)
-        made.guard = self.check_unchanged
         M, nothing = derivatives(slopes, inputs[-d:]), [0.0] * d
-        constant = all(isinstance(x, float) for row in M for x in row)
-        moves = any(Program(inputs, slopes)(*[0.0] * len(inputs)))  # at p = 0
-        if constant and not moves and np.linalg.eigvalsh(M)[0] > 0:
-            return made, simplest(np.array(M)), True
         state, t, _ = self._known
         elsewhere = [t] * self.timed + state[:d].tolist()
+        p0 = nothing if np.isfinite(H(*map(np.float64, (*elsewhere, *nothing)))[0]) else state[d:].tolist()
+        made = CallableHamiltonian(d, _AtRest(self._functions[1], p0), None, None, None, self.given, self.timed)
+        made.guard = self.check_unchanged
+        if p0 is nothing and all(isinstance(x, float) for row in M for x in row):
+            moves = any(Program(inputs, slopes)(*elsewhere, *nothing))
+            if not moves and np.linalg.eigvalsh(M)[0] > 0:
+                return made, simplest(np.array(M)), True
 
         def kinetic(*p: Any) -> list[Any]:
-            return [H(*elsewhere, *p)[0] - H(*elsewhere, *nothing)[0]]
+            return [H(*elsewhere, *p)[0] - H(*elsewhere, *p0)[0]]
 
         T = TracedHamiltonian(d, traced(kinetic, *(f"p{i + 1}" for i in range(d))), False)
         made._kinetic, made.kinetic = T.program, T.value
@@ -601,13 +603,14 @@ def _checked(value: Any, x: Array, name: str, tail: tuple[int, ...]) -> Array:
 
 
 class _AtRest:
-    """V(q) = H(q, 0) of an H that is a sum T(p) + V(q), with the time first where there is one."""
+    """V(q) = H(q, p0) of an H that is a sum T(p) + V(q), with the time first where there is one."""
 
-    def __init__(self, hamiltonian: Callable[..., Any]) -> None:
-        self.hamiltonian = hamiltonian
+    def __init__(self, hamiltonian: Callable[..., Any], p0: Sequence[float]) -> None:
+        self.hamiltonian, self.p0 = hamiltonian, p0
 
     def __call__(self, *arguments: Any) -> Any:
-        return self.hamiltonian(*arguments, library(arguments[-1]).zeros_like(arguments[-1]))
+        q, p0 = arguments[-1], np.array(self.p0)
+        return self.hamiltonian(*arguments, library(q).zeros_like(q) + (like(p0, q) if is_tensor(q) else p0))
 
 
 _ARGUMENTS = {"potential": "q", "hamiltonian": "q, p", "gradient": "q", "hessian_vector": "q, v"}

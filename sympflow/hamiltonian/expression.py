@@ -95,9 +95,10 @@ def stated(
             return of_sympy(read(expression, {*names, *coordinates}), names)
         return of_sympy(sp.sympify(expression, strict=True), names)
     except sp.SympifyError:
+        remedy = "; of a function make HamiltonianSystem(hamiltonian=f, ndof=d)" if callable(expression) else ""
         raise ValueError(
             f"`{argument}` must be a scalar expression; got {type(expression).__name__}: pass a string or a SymPy "
-            "expression."
+            f"expression{remedy}."
         ) from None
     except Unreadable as error:
         if isinstance(expression, str):

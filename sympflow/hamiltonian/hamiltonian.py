@@ -205,9 +205,11 @@ class Hamiltonian:
 
     def lift(self, y: Array) -> Array:
         """The states (..., 2d) for `y` of another width; a ValueError but for doubled systems, which have such."""
+        turned = y.ndim > 1 and len(y) == 2 * self.ndof
+        remedy = "Transpose it" if turned else "Join q and p along the last axis, np.concatenate([q, p], axis=-1)"
         raise ValueError(
             f"`y0` must have shape (..., {2 * self.ndof}) for {self.called}, [q, p] with {self.ndof} each; got "
-            f"{tuple(y.shape)}. Join q and p along the last axis, np.concatenate([q, p], axis=-1)."
+            f"{tuple(y.shape)}. {remedy}."
         )
 
     def identity_parts(self) -> Any:

@@ -472,14 +472,26 @@ def renamed(expression: str | sp.Expr, q: Any, p: Any) -> sp.Expr:
     rows = [[x] if isinstance(x, str | sp.Basic) else list(x or ()) for x in (q, p)]
     names = [str(x.func if isinstance(x, sp.Function) else x) for row in rows for x in row]
     if len(rows[0]) != len(rows[1]) or len(set(names)) < len(names) or not names:
-        raise ValueError(f"`q` and `p` must name d coordinates each, all different; got {q!r} and {p!r}.")
+        raise ValueError(
+            f"`q` and `p` must name d coordinates each, all different, as in q=['x', 'y'], p=['px', 'py']; got {q!r} "
+            f"and {p!r}."
+        )
     if isinstance(expression, str):
         f = stated("expression", expression, {*names, *_AMBIGUOUS})
     else:
-        functions = {x: sp.Symbol(str(x.func)) for row in rows for x in row if isinstance(x, sp.Function)}
-        f = of_sympy(expression.xreplace(functions), names)
+        given = dict(zip((x for row in rows for x in row), names, strict=True))
+        motions = {x: sp.Symbol(name) for x, name in given.items() if isinstance(x, sp.Function | sp.Derivative)}
+        f = of_sympy(expression.xreplace(motions), names)
     own = [sp.Symbol(f"{letter}{i + 1}", real=True) for letter in "qp" for i in range(len(rows[0]))]
-    return f.xreplace({sp.Symbol(name, real=True): symbol for name, symbol in zip(names, own, strict=True)})
+    f = f.xreplace({sp.Symbol(name, real=True): symbol for name, symbol in zip(names, own, strict=True)})
+    d = len(rows[0])
+    for i in range(d):
+        if not f.free_symbols & {own[i], own[d + i]}:
+            raise ValueError(
+                f"`q` and `p` name {names[i]!r} and {names[d + i]!r}, on which H does not depend: leave both out, or "
+                "add their terms to H."
+            )
+    return f
 
 
 def named_time(time: str | sp.Symbol | None, params: Mapping[str, Any]) -> sp.Symbol | None:

@@ -50,7 +50,10 @@ SHOWN_NAMES = (
 MOST_WRITTEN_OUT = 400
 """Coordinates of an expression before a warning: 512 of a chain take 2 s to define, and a step 14 times as long."""
 MEANT = {
-    **dict.fromkeys(("dim", "dimension", "dimensions"), "degrees of freedom of a function are `ndof`, of pairs `dim`."),
+    **dict.fromkeys(
+        ("dim", "dimension", "dimensions"),
+        "degrees of freedom are `ndof` of functions, `dim` of pairs, and read from a formula.",
+    ),
     "mass": "masses are in T(p), or `masses` of pairs.",
     **dict.fromkeys(
         ("site", "sites", "n_sites"), "the number of sites of a lattice is `shape`, their potential `onsite`."
@@ -278,7 +281,9 @@ class HamiltonianSystem(Hamiltonian, Answering):
                 raise TypeError(
                     f"`{argument}` must be a function; got the text {H!r}: HamiltonianSystem.from_sympy takes it."
                 )
-        what = f"a positive integer, at most {MOST_DEGREES:,}, the degrees of freedom"
+        what = (
+            f"a positive integer, at most {MOST_DEGREES:,}, the degrees of freedom, as in HamiltonianSystem(V, ndof=2)"
+        )
         d = checked_count("ndof", ndof, 1, MOST_DEGREES, what)
         if isinstance(time, str):
             raise TypeError(f"`time` must be True for functions with t first; got {time!r}: names are for from_sympy.")

@@ -33,7 +33,7 @@ _FIXED = {
 _ADAPTIVE = {"dt": "it chooses its own steps: give `rtol`, or `max_step` if it has one."}
 SYNONYMS = {
     **dict.fromkeys(("velocity_verlet", "stormer_verlet", "störmer_verlet", "kdk"), "verlet"),
-    **dict.fromkeys(("position_verlet", "drift_kick_drift", "dkd"), "leapfrog"),
+    **dict.fromkeys(("position_verlet", "drift_kick_drift", "dkd", "leap_frog"), "leapfrog"),
     **dict.fromkeys(("forest_ruth", "triple_jump"), "yoshida4"),
     **dict.fromkeys(("rkf45", "ode45", "runge_kutta"), "rk45"),
     **dict.fromkeys(("midpoint_implicit", "gauss2"), "implicit_midpoint"),
@@ -46,10 +46,13 @@ _STIFF = "It is for stiff dissipative systems, and not symplectic: take 'gauss_l
 ABSENT = {
     **dict.fromkeys(("radau", "bdf", "lsoda", "radau5", "cvode"), _STIFF),
     "whfast": "Its name here is 'wisdom_holman', with `corrector` where it is to have one.",
+    **dict.fromkeys(("mercurius", "trace"), "For close encounters take 'dop853' with `rtol`, 'wisdom_holman' else."),
     "ias15": "For close encounters take 'dop853' with `rtol`, or 'log_kahan_li8'.",
     "yoshida": "Did you mean 'yoshida4' or 'yoshida6'? 'kahan_li8' has smaller errors.",
     "ruth3": "Did you mean 'yoshida4'? A better one of few stages is 'omelyan4'.",
     "ruth4": "Did you mean 'yoshida4'?",
+    "rk23": "Did you mean 'rk45', or 'bosh3'?",
+    **dict.fromkeys(("odeint", "solve_ivp"), "It calls a method: did you mean 'dop853'?"),
     **dict.fromkeys(("tsit5", "vern7", "vern9", "bulirsch_stoer", "gbs"), "Did you mean 'dop853', with `rtol`?"),
     **dict.fromkeys(("symplectic", "splitting"), "Did you mean 'srkn11b', or 'kahan_li8'?"),
     "semi_implicit_euler": "Did you mean 'verlet', of order 2 at the same cost?",

@@ -43,8 +43,6 @@ class Comparison:
         self._given: Any = None
         self._next, self._gap = FIRST_LOOK, FIRST_LOOK
 
-    # at the start ---------------------------------------------------------------------------------
-
     def with_system(self, other: HamiltonianSystem) -> None:
         """Raise a ValueError if a system that was passed as the right-hand side is another, by its fingerprint."""
         mine = self.system
@@ -119,14 +117,12 @@ class Comparison:
         d = rows.shape[-1] // 2
         size = np.repeat([np.abs(rows[:, part]).max() or 1.0 for part in (slice(0, d), slice(d, None))], d)
         noise = np.random.Generator(np.random.PCG64(20260101)).uniform(-1, 1, (len(NEAR), 2 * d))
-        moves = size * noise * np.array(NEAR)[:, None]
-        within = self._within()
+        moves, within = size * noise * np.array(NEAR)[:, None], self._within()
         kinds = len(moves) + len(within)
         probes = []
         for k in range(max(3, -(-kinds // len(rows)))):
             kind = (np.arange(len(rows)) + k * len(rows)) % kinds
-            states = rows + moves[np.minimum(kind, len(moves) - 1)]
-            inside = kind >= len(moves)
+            states, inside = rows + moves[np.minimum(kind, len(moves) - 1)], kind >= len(moves)
             states[inside] = within[kind[inside] - len(moves)]
             probes.append(states.reshape(y0.shape))
         return probes
@@ -145,8 +141,6 @@ class Comparison:
         """The domain of a flow that was given alone, or a box about it, if its H is not known."""
         domain = self.flow.domain
         return domain.box if isinstance(domain, EnergySublevel) and domain.hamiltonian is None else domain
-
-    # along the run --------------------------------------------------------------------------------
 
     def is_due(self, n_steps: int) -> bool:
         """Return True if the run is to be compared again after so many steps: more and more seldom, never in rhythm."""

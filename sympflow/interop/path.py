@@ -141,8 +141,6 @@ class Path:
         flow = self.integrator.flow_for(self.system)
         return [] if flow is None else list(flow.parameters())
 
-    # events ------------------------------------------------------------------------------------------
-
     def first_zero(self, g: Callable[[Tensor, Tensor], Tensor]) -> tuple[Tensor, Tensor]:
         """The elapsed time s at which g(s, ψ_s(y0)), a number, first vanishes, and the state there; differentiable."""
         if not readable(self.y0) or (self.eager and not readable(self.step(self.y0, self.h, self.t0))):

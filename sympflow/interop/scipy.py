@@ -59,8 +59,7 @@ def as_scipy(method: Any, system: HamiltonianSystem | None = None, **options: An
     >>> solve_ivp(system, (0, 10), system.y0, method=Verlet).y.shape
     (4, 101)
     """
-    integrator = fixed_step(method, options, "SciPy", *([] if system is None else [system]))
-    return _solver_class(integrator, system)
+    return _solver_class(fixed_step(method, options, "SciPy", *([] if system is None else [system])), system)
 
 
 def _solver_class(integrator: FixedStep, system: HamiltonianSystem | None) -> type[FlowSolver]:
@@ -305,8 +304,7 @@ class FlowOutput(DenseOutput):
 
     def _call_impl(self, t: np.ndarray) -> np.ndarray:
         times = np.atleast_1d(t).astype(float)
-        states = np.repeat(self._anchor[None], len(times), axis=0)
-        h = times - self._t_anchor
+        states, h = np.repeat(self._anchor[None], len(times), axis=0), times - self._t_anchor
         moving = (h != 0) & (times != self.t)
         states[times == self.t] = self._y
         if moving.any():

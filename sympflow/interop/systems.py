@@ -194,10 +194,8 @@ def _probes(ndof: int, y0: ArrayLike | None) -> Tensor:
 
 def _mass(hessian: Tensor, gradient: Callable[[Tensor], Tensor], probes: Tensor) -> np.ndarray | None:
     """M if H is ½ pᵀM⁻¹p + V(q) at all probes, judged by what does not depend on the units of q, p and H."""
-    d = probes.shape[-1] // 2
-    A = hessian.detach().numpy()
-    size = _size(A)
-    K = A[:, d:, d:]
+    d, A = probes.shape[-1] // 2, hessian.detach().numpy()
+    size, K = _size(A), A[:, d:, d:]
     units = size[d:, d:]
     if not np.isfinite(A).all() or (K.diagonal(axis1=1, axis2=2) <= 0).any():
         return None

@@ -108,8 +108,7 @@ def _integrated(
     compared = _Compared(func, y0, t, integrator, system)
     if event_fn is None:
         announced = _announced(func, y, t, pack, integrator)
-        path = make_path(integrator, system, y, direction, t[0], before_step=announced)
-        return pack(compared.run(path, t))
+        return pack(compared.run(make_path(integrator, system, y, direction, t[0], before_step=announced), t))
     if len(t) != 2:
         raise ValueError(f"`t` must have 2 entries with `event_fn`, the start and a direction; got {len(t)}.")
     found, states = _until_event(make_path(integrator, system, y, direction, t[0]), t[0], event_fn, pack)
@@ -264,8 +263,7 @@ def odeint_adjoint(
         given = tuple(func.parameters())
 
     def make_path(integrator: FixedStep, system: HamiltonianSystem | None, y: Tensor, *more: Any, **named: Any) -> Path:
-        start = float(one_lane(t)[0])
-        learns = system is not None and system.learns(y)
+        start, learns = float(one_lane(t)[0]), system is not None and system.learns(y)
         field = [system.vector_field(unfollowed(y), start)] if system is not None and learns else []
         parameters = (*(given or ()), *(leaf for slope in field if adjoint_params is None for leaf in leaves(slope)))
         flow = integrator.flow_for(system)  # type: ignore[arg-type]
@@ -313,8 +311,7 @@ def _theirs(run: Any, func: Any, y0: Any, *where: Any, over: Any, endless: bool 
     except ValueError as error:
         if not str(error).startswith("Invalid method"):
             raise
-        name = str(error).split('"')[1]
-        known = sorted({*available(), *_THEIRS})
+        name, known = str(error).split('"')[1], sorted({*available(), *_THEIRS})
         hint = did_you_mean(name.lower(), known)
         raise ValueError(f"`method` {name!r} is unknown.{hint} Choose one of {', '.join(known)}.") from None
 
@@ -377,8 +374,7 @@ def _with_jumps(t: Tensor, length: float | None, jumps: np.ndarray) -> Tensor:
     if length is not None:
         n_steps = math.ceil(float(abs(t[-1] - t[0])) / length)
         grid = torch.cat([t[0] + torch.arange(n_steps).to(t) * torch.sign(t[-1] - t[0]) * length, t[-1:]])
-    at = torch.as_tensor(jumps).to(t)
-    near = 1e-9 * (grid[1:] - grid[:-1]).abs().min()
+    at, near = torch.as_tensor(jumps).to(t), 1e-9 * (grid[1:] - grid[:-1]).abs().min()
     apart = ((grid[1:-1, None] - at).abs() > near).all(-1)
     return torch.cat([grid[:1], torch.cat([grid[1:-1][apart], at]).sort(descending=bool(t[-1] < t[0]))[0], grid[-1:]])
 
@@ -578,8 +574,7 @@ class _Solver:
         self.direction, shapes, announced = 1, None, func
         while type(func).__module__.startswith("torchdiffeq"):
             self.direction = -1 if type(func).__name__ == "_ReverseFunc" else self.direction
-            shapes = getattr(func, "shapes", shapes)
-            func = func.base_func
+            shapes, func = getattr(func, "shapes", shapes), func.base_func
         integrator, system = _build(func, self.method, options)
         self.y0, self.shapes, self.func = y0, shapes, func
         self.integrator, self.system = integrator, system

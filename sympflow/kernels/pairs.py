@@ -149,7 +149,7 @@ def few(local: PairsHamiltonian) -> tuple[Callable[..., Splitting] | None, tuple
     """The splitting of a few bodies, None of more, and the values that it reads."""
     if not local.is_few:
         return None, ()
-    symbols: Any = FewSymbols(local)
+    symbols = FewSymbols(local)
     return partial(FewSplitting, symbols), symbols.values
 
 
@@ -158,7 +158,7 @@ class FewSplitting(Splitting):
 
     @property
     def key(self) -> tuple[Any, ...]:
-        local: Any = self.symbols.local  # type: ignore[union-attr]
+        local = self.symbols.local
         pair = local.V, local.first, local.c, local.cutoff is None, local.box is None
         return *pair, local.n_bodies, local.dim, self.level, self.compensated, self.friction
 
@@ -177,8 +177,7 @@ class FewShape(Shape):
 
     @property
     def _local(self) -> PairsHamiltonian:
-        local: PairsHamiltonian = self.symbols.local  # type: ignore[union-attr]
-        return local
+        return self.symbols.local
 
     def _kicked(self) -> list[Any]:
         return self._moved([self.made.node(p) for p in self.p])

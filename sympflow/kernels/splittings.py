@@ -25,8 +25,7 @@ from sympflow.kernels.stages import kicks_of
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT
 
 if TYPE_CHECKING:
-    from sympflow.hamiltonian.formulas import TracedDriving, TracedHamiltonian
-    from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
+    from sympflow.hamiltonian.formulas import TracedDriving
     from sympflow.kernels.approximations import OnInterval, Ranges
     from sympflow.kernels.stage_times import Driving
 
@@ -47,7 +46,7 @@ class Splitting:
     table.
     """
 
-    symbols: SymbolicHamiltonian | TracedHamiltonian
+    symbols: Any  # a SymbolicHamiltonian, a TracedHamiltonian, or what is like these
     level: int
     monomials: Monomials = ()
     compensated: bool = False
@@ -210,7 +209,6 @@ class Shape:
     def _by_mass(self, v: Sequence[Any]) -> list[Any]:
         """M⁻¹v."""
         M, entry = self.symbols.inverse_mass, self._of_parameters
-        assert M is not None
         return [dot([entry(M[i, j]) for j in range(self.d)], v) for i in range(self.d)]
 
     def _of_parameters(self, f: Any) -> Any:
@@ -223,7 +221,6 @@ class Shape:
             return [self.made.number(a * x) for x in self._by_mass(p)]
         numbers = zip((*self.symbols.p, *self.symbols.parameters), (*p, *self.values), strict=True)
         kinetic = evaluator(dict(numbers))
-        assert self.symbols.T is not None
         return [self.made.number(a * kinetic(self.symbols.T.diff(s))) for s in self.symbols.p]
 
     def _drifted(self, momenta: list[Any]) -> tuple[list[Any], list[Any]]:
@@ -296,7 +293,8 @@ class WithinRange:
 
     def __init__(self, near: Stage, exact: Stage, low: float, high: float) -> None:
         self.near, self._exact, self._low, self._high = near, exact, low, high
-        self.table = _Both(near.table, exact.table)
+        inputs = near.table.inputs
+        self.table = traced(lambda *x: [*near.table(*x), *exact.table(*x)], *map(repr, inputs))
 
     def body(self, q: Value, *rest: Value) -> list[Value]:
         """The state after the stage."""
@@ -313,21 +311,9 @@ class WithinRange:
         return code.when(code.any(~inside), exact, lambda: near, rare=True)
 
 
-class _Both:
-    """Two programs of the same inputs, with the outputs of both."""
-
-    def __init__(self, *programs: Program) -> None:
-        self._programs = programs
-        self.outputs = [x for program in programs for x in program.outputs]
-
-    def __call__(self, *values: Any) -> list[Any]:
-        return [x for program in self._programs for x in program(*values)]
-
-
 def _of_kick(symbols: Any, terms: int) -> list[Any]:
     """V′, V″M⁻¹V′ and (½ V′M⁻¹V″M⁻¹V′)′ of one position, as many as there are terms."""
     V, M = symbols.V, symbols.inverse_mass
-    assert V is not None
     slope = V.diff(symbols.q[0])
     if terms == 1 or M is None:
         return [slope]
@@ -343,7 +329,6 @@ def _kick_changes(
     changes = [-times(kicks[0], x) for x in slope]
 
     def by_mass(v: Sequence[Any]) -> list[Any]:
-        assert M is not None
         return [dot([known(M[i, j]) for j in range(d)], v) for i in range(d)]
 
     if terms > 1:

@@ -130,10 +130,8 @@ class Reading:
 
     def test(self, theta: np.ndarray, states: np.ndarray, scales: np.ndarray) -> tuple[float, float]:
         """LᵀJ + JL over twice JL, 0 for any H, at states (2d, n) in the order of the reading; the rate of volumes."""
-        slopes = self.field.field(theta, states, True, False).slope
-        back = np.argsort(self.rows)
-        slopes = slopes[np.ix_(back, back)]
-        d = len(scales) // 2
+        slopes, back = self.field.field(theta, states, True, False).slope, np.argsort(self.rows)
+        slopes, d = slopes[np.ix_(back, back)], len(scales) // 2
         ratio = np.sqrt(scales[:d] / scales[d:])
         units = np.concatenate([ratio, 1 / ratio])  # in which dq∧dp remains as it is
         L = slopes * (units / units[:, None])[..., None]
@@ -167,8 +165,7 @@ def best_by_increments(
     data: Trajectories, held: Trajectories, models: Sequence[Model], drives: Sequence[Drive] = (), stop: Stop = never
 ) -> tuple[int, Reading | None, dict[int, float]] | None:
     """The place of the model that explains held-out increments best, a doubt, and the squares by places; or None."""
-    scales, d = data.scales, data.ndof
-    fitted, others = data.sample, held.sample
+    scales, d, fitted, others = data.scales, data.ndof, data.sample, held.sample
     affordable = [k for k, model in enumerate(models) if affords(fitted, model)]
     if not affordable or not others.runs:
         return None
@@ -220,8 +217,7 @@ def _left(model: Field, data: Trajectories, held: Trajectories, scales: np.ndarr
 
 def hint(library: Library, smooth: Smooth, data: Trajectories, force: Any = None, drives: Any = ()) -> str | None:
     """The likeliest reason, none that the model has, why terms do not explain the data, with the remedy; or None."""
-    d, scales = data.ndof, data.scales
-    smooth = smooth.some(MOST_SLOPES)
+    d, scales, smooth = data.ndof, data.scales, smooth.some(MOST_SLOPES)
     x, v = smooth.points, smooth.slopes
     X = library.fields(x)
     if force is not None:
@@ -324,8 +320,7 @@ def _columns(X: np.ndarray, scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 def drive_frequency(X: np.ndarray, smooth: Smooth, scales: np.ndarray, drive: Drive) -> float:
     """The ω at which a drive explains most of what the fields X (n, 2d, K) leave of slopes."""
-    d = X.shape[1] // 2
-    most = min(int(2 * smooth.longest / smooth.step), FREQUENCIES)
+    d, most = X.shape[1] // 2, min(int(2 * smooth.longest / smooth.step), FREQUENCIES)
     frequencies = np.pi / smooth.longest * np.arange(0.5, max(most, 2) / 2, 0.25)
     beside = Rest.of(X, smooth.slopes, scales)
     pushes = drive.base.gradient(np.zeros(drive.base.n), smooth.points.T[:d], False, True).by_parameters
@@ -389,8 +384,7 @@ def _masses(library: Library, x: np.ndarray, v: np.ndarray, scales: np.ndarray, 
     target = np.zeros((len(x), d))
     target[:, 0] = v[:, d]
     theta = least(A, (target / scales[d:]).ravel())
-    masses = np.concatenate([[1.0], theta[len(of_q) :]])
-    force = -(V @ theta[: len(of_q)])
+    masses, force = np.concatenate([[1.0], theta[len(of_q) :]]), -(V @ theta[: len(of_q)])
     with np.errstate(all="ignore"):
         rest = ((force / masses - v[:, d:]) / scales[d:]) ** 2
     moving = ((x[:, d:] - v[:, :d]) / scales[:d]) ** 2

@@ -77,8 +77,7 @@ class Regression:
     @classmethod
     def of_slopes(cls, library: Library, smooth: Smooth, scales: np.ndarray) -> Regression:
         """ẋ ≈ Σ θ_k J∇f_k(x) at smoothed states, each coordinate in its spread."""
-        X = library.fields(smooth.points) / scales[:, None]
-        y = (smooth.slopes / scales).ravel()
+        X, y = library.fields(smooth.points) / scales[:, None], (smooth.slopes / scales).ravel()
         return cls(X.reshape(len(y), -1), y, len(y) / CORRELATED)
 
     @classmethod
@@ -236,8 +235,7 @@ class Discovery:
     def figure(self) -> Figure:
         """The path of models: the residual over the noise against the number of terms."""
         figure = new_figure(6.4, 3.6)
-        ax = figure.add_subplot()
-        counts = [len(model.terms) for model in self.path]
+        ax, counts = figure.add_subplot(), [len(model.terms) for model in self.path]
         ax.plot(counts, [model.residual for model in self.path], "o-", color="#0072B2", label="fitted trajectories")
         held = [math.nan if model.held_out is None else model.held_out for model in self.path]
         if not np.isnan(held).any():
@@ -432,8 +430,7 @@ class _Search:
         K = len(self.library)
         if not K:
             raise ValueError("`terms` has no term that changes over the data: give others.")
-        equations = data.n_values - 2 * data.ndof * n
-        asked = K + len(self.superfluous)
+        equations, asked = data.n_values - 2 * data.ndof * n, K + len(self.superfluous)
         if equations < asked:
             raise ValueError(
                 f"`data` has {data.n_values} values, {equations} beside the initial states, and the library {asked} "
@@ -628,8 +625,7 @@ class _Search:
         significance = fit.theta**2 / np.maximum(np.diag(fit.covariance()), 1e-300)
         for weakest in np.argsort(significance)[:2]:
             rest = [k for i, k in enumerate(active) if i != weakest]
-            known = frozenset(rest) in self.fits
-            made = self._fit(rest, active, steps)
+            known, made = frozenset(rest) in self.fits, self._fit(rest, active, steps)
             promised = self._criterion(active) - self.penalty + significance[weakest]
             worse = self._criterion(rest) > promised + WORTH * self.penalty
             if known and worse and significance[weakest] < self.penalty:
@@ -729,8 +725,7 @@ class _Search:
 
     def _unseen(self, chosen: list[int], fit: Fit) -> tuple[sp.Expr, ...]:
         """Functions that are the same along all orbits: of q alone and of p alone where H is separable."""
-        d = self.data.ndof
-        states = np.concatenate(fit.orbits, axis=1).T
+        d, states = self.data.ndof, np.concatenate(fit.orbits, axis=1).T
         errors = fit.noise() * math.sqrt(fit.states.size / fit.counts.sum())
         separable = all(self.library.terms[k].kind(d) != "y" for k in chosen)
         groups = [range(d), range(d, 2 * d)] if separable else [range(2 * d)]

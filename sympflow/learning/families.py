@@ -106,8 +106,7 @@ class Constraints:
     def driven(self, frequency: float) -> Drive:
         """Forces and stiffnesses of this frequency: of degree 2 in q, of an angle its first harmonic."""
         scales, periods = self.scales[: self.ndof], self.periods[: self.ndof]
-        base = Waves.up_to(1, 2, "q", scales, periods)
-        pushes = np.eye(self.ndof)[np.isfinite(periods)]
+        base, pushes = Waves.up_to(1, 2, "q", scales, periods), np.eye(self.ndof)[np.isfinite(periods)]
         exponents = np.concatenate([base.powers.exponents, pushes])
         waves, phases = np.concatenate([base.waves, 0 * pushes]), np.concatenate([base.phases, 0 * pushes[:, 0]])
         return Drive(Waves("q", exponents, waves, phases, scales), frequency)
@@ -351,8 +350,7 @@ def pruned(candidate: Candidate, theta: np.ndarray, precision: np.ndarray, value
             break
         dropped[k] = True
         column = covariance[:, k] / covariance[k, k]
-        theta = theta - column * theta[k]
-        covariance = covariance - np.outer(column, covariance[k])
+        theta, covariance = theta - column * theta[k], covariance - np.outer(column, covariance[k])
     if not dropped.any():
         return None
     left = model.without(dropped)

@@ -238,9 +238,6 @@ def _span(found: Fitted, data: Trajectories, states: np.ndarray, spread: np.ndar
     return soonest if math.isfinite(soonest) else max(run.span for run in data.runs)
 
 
-# held-out trajectories ------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class Held:
     """How well a model explains trajectories that it was not fitted to; only their initial states are fitted."""
@@ -296,8 +293,7 @@ class Held:
 
 def judged(found: Fitted, held: Trajectories, setting: Setting) -> Held:
     """The likelihood of held-out trajectories."""
-    scales = held.scales
-    pieces = _pieces(held, found.span)
+    scales, pieces = held.scales, _pieces(held, found.span)
     sigma = np.maximum(found.sigma, EXACT * scales)
     problem = Problem(found.model, pieces, found.method, sigma, frozen=True, huber=setting.huber)
     states = _states(found, held, pieces, sigma, setting)
@@ -319,8 +315,7 @@ def judged(found: Fitted, held: Trajectories, setting: Setting) -> Held:
     some = int(pairs * (1 - near) / (1 + near)) if near > SMOOTHED else 0
     lagged = setting.lag > held.time_scale and some >= FEWEST_PAIRS and abs(far) < FORGOTTEN
     correlation, pairs = (far, some) if lagged else (near, beside)
-    losses = np.where(np.isfinite(losses), losses, np.inf)
-    loudness = math.sqrt(fit.cost / values)
+    losses, loudness = np.where(np.isfinite(losses), losses, np.inf), math.sqrt(fit.cost / values)
     excess = 0.0
     if setting.seen is not None and (setting.seen > 0).any() and not lagged:  # else it is not seen
         excess = float(np.max(found.sigma[setting.seen > 0] / setting.seen[setting.seen > 0]))

@@ -69,8 +69,7 @@ class Inertia(Part):
 
     def gradient(self, theta: np.ndarray, x: np.ndarray, slope: bool, by_parameters: bool) -> Linear:
         m, N = x.shape
-        d = m // 2
-        C = self._coefficients(theta)
+        d, C = m // 2, self._coefficients(theta)
         f, (first, second) = self.functions.functions(x[:d]), self.functions.derivatives(x[:d])
         W = self._inverse(self._matrices(C @ f))
         v = np.einsum("ijn,jn->in", W, x[d:])
@@ -82,8 +81,7 @@ class Inertia(Part):
         u = np.stack([np.einsum("ijn,jn->in", self._matrices(rows), v) for rows in moved])  # (∂M/∂q_k) v
         slopes = by = None
         if slope:
-            Wu = np.einsum("ijn,kjn->kin", W, u)
-            slopes = np.empty((m, m, N))
+            Wu, slopes = np.einsum("ijn,kjn->kin", W, u), np.empty((m, m, N))
             slopes[d:, d:] = W
             slopes[d:, :d] = -Wu.transpose(1, 0, 2)
             slopes[:d, d:] = -Wu
@@ -91,8 +89,7 @@ class Inertia(Part):
                 curved = -0.5 * ((C[:, used] @ rows) * products).sum(axis=0) + (u[i] * Wu[j]).sum(axis=0)
                 slopes[i, j] = slopes[j, i] = curved
         if by_parameters:
-            by = np.empty((m, self.n, N))
-            k, pair = self.entries[:, 0], self._pair
+            by, k, pair = np.empty((m, self.n, N)), self.entries[:, 0], self._pair
             g = f[k] - self._shift[:, None]
             pulled = np.stack([W[:, i] * v[j] + (W[:, j] * v[i] if i != j else 0.0) for i, j in self.pairs], axis=1)
             for i in range(d):
@@ -105,8 +102,7 @@ class Inertia(Part):
         d, N = q.shape
         f, first = self.functions.functions(q), self.functions.derivatives(q)[0]
         k, pair = self.entries[:, 0], self._pair
-        g = f[k] - self._shift[:, None]
-        made = np.zeros((2 * d, self.n, N))
+        g, made = f[k] - self._shift[:, None], np.zeros((2 * d, self.n, N))
         for place, (i, j) in enumerate(self.pairs):
             own = pair == place
             made[i, own] = g[own] * v[j]

@@ -25,10 +25,6 @@ MOST_NUMBERS = 2**20  # of the derivatives of a batch, which then stay in the ca
 SLOPE_POINTS = 10  # of a piece, that give a velocity which was not observed
 SOLVED = 1e-4  # of the error of a scheme, to which its equations are solved
 
-
-# orbits with their derivatives ----------------------------------------------------------------------------------------
-
-
 Orbit = Iterator[tuple[Array, Array | None]]
 """States (2d, N) and derivatives (2d, c, N) at one point after another."""
 Over = Callable[[Array, Array | None, Array, Array], Any]
@@ -87,8 +83,7 @@ class Splitting(Stepper):
         x[moved] += w * f.value
         if X is None or f.slope is None:
             return
-        first = 2 * len(f.value)
-        by = X[of]
+        first, by = 2 * len(f.value), X[of]
         if f.slope.shape[-1] == 1:
             X[moved] += w * np.tensordot(f.slope[..., 0], by, 1)
             if f.by_parameters is not None:
@@ -124,8 +119,7 @@ class Gauss(Stepper):
     def step(self, model: Field, theta: Array, x: Array, X: Array | None, h: Array, t: Array) -> Any:
         A, b = self._table
         m, N = x.shape
-        s = self.stages
-        model = model.at((t + h * A.sum(axis=1)[:, None]).ravel())
+        s, model = self.stages, model.at((t + h * A.sum(axis=1)[:, None]).ravel())
         K = np.repeat(model.at(t).field(theta, x, False, False).value[:, None], s, axis=1)  # (m, s, N)
         before, near = math.inf, np.reshape(self.tolerance, (-1, 1, 1))
         for _ in range(self.iterations):
@@ -141,8 +135,7 @@ class Gauss(Stepper):
         end = x + h * np.einsum("j,mjn->mn", b, K)
         if X is None:
             return end, None
-        inner = x[:, None] + h * np.einsum("ij,mjn->min", A, K)
-        c = X.shape[1]
+        inner, c = x[:, None] + h * np.einsum("ij,mjn->min", A, K), X.shape[1]
         f = model.field(theta, inner.reshape(m, s * N), True, c > m)
         S = np.broadcast_to(f.slope, (m, m, s * N)).reshape(m, m, s, N)
         rhs = np.einsum("klin,lcn->nikc", S, X, optimize=True)
@@ -202,9 +195,6 @@ class Method:
         return self.stepper.orbit(partial(self.over, model, theta), x, X, gaps, t)
 
 
-# observations ---------------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class Batch:
     """Pieces of trajectories of about one length, side by side."""
@@ -218,8 +208,7 @@ class Batch:
 
 def batches(runs: Sequence[Run], columns: int) -> list[Batch]:
     """The runs in batches, of lengths that differ by a third at most."""
-    order = np.argsort([run.n_points for run in runs], kind="stable")
-    m = len(runs[0].y)
+    order, m = np.argsort([run.n_points for run in runs], kind="stable"), len(runs[0].y)
     most = max(1, MOST_NUMBERS // (m * columns))
     made: list[Batch] = []
     start = 0
@@ -234,8 +223,7 @@ def batches(runs: Sequence[Run], columns: int) -> list[Batch]:
             run = runs[i]
             gaps[1 : run.n_points, column] = np.diff(run.t)
             y[: run.n_points, :, column] = run.y.T
-        seen = np.isfinite(y)
-        starts = np.array([runs[i].t[0] for i in index])
+        seen, starts = np.isfinite(y), np.array([runs[i].t[0] for i in index])
         made.append(Batch(index, gaps, np.where(seen, y, 0.0), seen.astype(float), starts))
         start = stop
     return made

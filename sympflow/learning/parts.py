@@ -174,8 +174,7 @@ class Polynomial(Sum):
         return self._monomials(x)(self.exponents)
 
     def derivatives(self, x: np.ndarray) -> tuple[np.ndarray, Curvature]:
-        made = self._monomials(x)
-        first = np.zeros((len(x), self.n, x.shape[1]))
+        made, first = self._monomials(x), np.zeros((len(x), self.n, x.shape[1]))
         for row, (factor, left) in zip(first, self._derivatives.values(), strict=False):
             np.multiply(made(left), factor[:, None], out=row)
         second = (
@@ -375,8 +374,7 @@ class Network(Part):
                 slopes[i, i] += w @ (s1 * (a[:, rows[i]] @ second[rows[i]]))
         if not by_parameters:
             return Linear(value, slopes)
-        by = np.empty((m, self.n, N))
-        e = len(self.inputs)
+        by, e = np.empty((m, self.n, N)), len(self.inputs)
         for i in range(m):
             np.multiply(s1, along[i], out=by[i, :K])
             bent = (w[:, None] * s2) * along[i]

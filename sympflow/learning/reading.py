@@ -55,8 +55,6 @@ class Run:
         return Run(self.t[start:stop], np.ascontiguousarray(self.y[:, start:stop]))
 
 
-# the kinds of data ----------------------------------------------------------------------------------------------------
-
 Found = tuple[str, np.ndarray, np.ndarray]
 """The name of a trajectory for messages, its times and states, not checked yet."""
 
@@ -137,17 +135,20 @@ def _of_pair(t: Any, y: Any) -> Iterator[Found]:
         return
     times = t.reshape(-1, t.shape[-1]) if t.ndim else t
     if t.shape != (*y.shape[:-2], y.shape[-1]):
-        raise ValueError(f"`data` has times of shape {t.shape} and states of shape {y.shape}: give t (n,), or (N, n).")
+        raise ValueError(
+            f"`data` has times of shape {t.shape} and states of shape {y.shape}: give t (n,) for all, or (N, n)."
+        )
     for i, (own, one) in enumerate(zip(times, states, strict=True)):
         yield f"trajectory {i}", own[kept := np.isfinite(own)], one[:, kept]  # ragged trajectories are padded
 
 
 def _of_ends(x: Any, t: Any, y: Any) -> Iterator[Found]:
-    x, y = _numbers(x, "states"), _numbers(y, "states")
-    t = _numbers(t, "times")
+    x, y, t = _numbers(x, "states"), _numbers(y, "states"), _numbers(t, "times")
     t = t[:, 0] if t.ndim == 2 and t.shape[1] == 1 else t
     if x.shape != y.shape or t.shape not in ((), (1,), (len(x),)):
-        raise ValueError(f"`data` is (x, t, y) of shapes {x.shape}, {t.shape}, {y.shape}: give (N, 2d), (N,), (N, 2d).")
+        raise ValueError(
+            f"`data` is (x, t, y) of shapes {x.shape}, {t.shape}, {y.shape}: give x (N, 2d), t (N,) and y (N, 2d)."
+        )
     for i, (start, later, end) in enumerate(zip(x, np.broadcast_to(t, len(x)), y, strict=True)):
         yield f"pair {i}", np.array([0.0, later]), np.stack([start, end], 1)
 
@@ -173,7 +174,9 @@ def of_mapping(data: Mapping[str, Any], ndof: int | None, time: str | None, q: A
     runs = t.ndim == 2 or ndof == 1  # q (N, n) of one degree of freedom
     made = [a[:, None] if a.ndim == 2 and runs else a for a in halves if a is not None]
     if made[0].ndim == 2 and ndof is None:
-        raise ValueError(f"{said}: q (k, n) may be k coordinates or k trajectories: pass `ndof`.")
+        raise ValueError(
+            f"{said}: of q (k, n) it cannot be told whether these are k coordinates or k trajectories: pass `ndof`."
+        )
     return t, np.concatenate(made, axis=-2)
 
 
@@ -242,7 +245,9 @@ def _of_file(path: Path) -> Any:
     if ending in (".nc", ".netcdf"):
         with xarray.open_dataset(path) as data:
             return _loaded(data)
-    raise ValueError(f"`data` names a file {ending or 'without an ending'}: .csv, .parquet, .npz, .nc, .zarr are read.")
+    raise ValueError(
+        f"`data` names a file {ending or 'without an ending'}: .csv, .parquet, .npz, .nc and .zarr are read."
+    )
 
 
 def _header(path: Path) -> dict[str, Any]:
@@ -388,9 +393,6 @@ def _numbered(columns: list[str], letter: str) -> list[str]:
     found = [(c, re.fullmatch(form, c.lower())) for c in columns]
     numbers = {int("".join(m.groups("")) or 1): c for c, m in found if m}
     return [numbers[i] for i in range(1, len(numbers) + 1)] if sorted(numbers) == [*range(1, len(numbers) + 1)] else []
-
-
-# checks ---------------------------------------------------------------------------------------------------------------
 
 
 def width_of(found: list[Found], ndof: int | None) -> int:

@@ -206,8 +206,7 @@ class Search:
     @property
     def reason(self) -> str:
         """Why this model."""
-        held = self.best[2]
-        others = len({record["model"] for record in self.history}) - 1
+        held, others = self.best[2], len({record["model"] for record in self.history}) - 1
         because = (
             "its residuals on held-out trajectories are no more than rounding"
             if held.exact
@@ -705,6 +704,5 @@ class Search:
         """𝓗 of the flow at states (n, 2d), averaged over [0, Δt]; with friction H."""
         if flow.system is not None and flow.system.friction:  # the maps of a damped flow have no 𝓗
             return flow.system.hamiltonian(states)
-        x = torch.as_tensor(states)
-        times = flow.dt * np.arange(OVER_TIMES) / (OVER_TIMES - 1)
+        x, times = torch.as_tensor(states), flow.dt * np.arange(OVER_TIMES) / (OVER_TIMES - 1)
         return np.mean([flow.hamiltonian(float(t), x).numpy() for t in times], axis=0)

@@ -62,12 +62,10 @@ class Normal:
             found = np.linalg.solve(damped, np.concatenate([self.B, self.a[..., None]], axis=2))
         except np.linalg.LinAlgError:
             return None
-        Q, x = found[..., :n], found[..., n]
-        theta = np.zeros(n)
+        Q, x, theta = found[..., :n], found[..., n], np.zeros(n)
         if n:
             flat = self.B.reshape(N * m, n)
-            S = self.C - flat.T @ Q.reshape(N * m, n)
-            D = np.sqrt(np.where(scale > 0, scale, 1.0))
+            S, D = self.C - flat.T @ Q.reshape(N * m, n), np.sqrt(np.where(scale > 0, scale, 1.0))
             try:
                 factor = cho_factor(S / np.outer(D, D) + damping * np.eye(n), check_finite=False)
             except np.linalg.LinAlgError:
@@ -81,8 +79,7 @@ class Normal:
     def reduced(self) -> tuple[np.ndarray, np.ndarray]:
         """JᵀJ (n, n) and −Jᵀr (n,) of θ when the initial states are eliminated."""
         n = self.C.shape[0]
-        flat = self.B.reshape(-1, n)
-        inverse = np.linalg.pinv(self.A, hermitian=True)
+        flat, inverse = self.B.reshape(-1, n), np.linalg.pinv(self.A, hermitian=True)
         x = (inverse @ self.a[..., None])[..., 0]
         return self.C - flat.T @ (inverse @ self.B).reshape(-1, n), self.c - flat.T @ x.reshape(-1)
 
@@ -174,8 +171,7 @@ class Problem:
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")
     def growth(self, theta: np.ndarray, states: np.ndarray, scales: np.ndarray, limit: float) -> np.ndarray:
         """The times (N,) after which an error of the initial state has grown by a limit; infinite where it has not."""
-        made = np.full(len(states), np.inf)
-        m = len(scales)
+        made, m = np.full(len(states), np.inf), len(scales)
         for batch in self.batches:
             for k, _, X in self._orbits(batch, theta, states, True):
                 assert X is not None
@@ -203,8 +199,7 @@ class Problem:
                     return made
                 for i in range(m):
                     J = by[i] * (np.sqrt(weight[i]) / self.sigma[i])
-                    rest = np.sqrt(weight[i]) * r[i]
-                    by_state, by_theta = J[:m], J[m:]
+                    rest, by_state, by_theta = np.sqrt(weight[i]) * r[i], J[:m], J[m:]
                     a += by_state * rest
                     for j in range(m):
                         A[j] += by_state[j] * by_state

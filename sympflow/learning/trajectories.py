@@ -56,6 +56,10 @@ class Trajectories(Shown):
     names: tuple[str, ...]
     velocities: bool = False
 
+    def __post_init__(self) -> None:
+        if not all(isinstance(run, Run) for run in self.runs):
+            raise TypeError("`runs` are made from data by Trajectories.read, as in Trajectories.read((t, y)).")
+
     @classmethod
     def read(
         cls,
@@ -145,8 +149,7 @@ class Trajectories(Shown):
             found, names = reading.of_table(data, ndof, order, time, run, q, p, velocity_mass is not None, observed)
             order = "halves"
         elif _is_a("xarray", "Dataset", data):
-            found, names = reading.of_dataset(data), ()
-            order = "halves"
+            found, names, order = reading.of_dataset(data), (), "halves"
         elif isinstance(data, str | Path):
             return cls.read(reading.opened(Path(data)), ndof, **given, **converted)
         elif (
@@ -248,8 +251,7 @@ class Trajectories(Shown):
         """
         d = self.ndof
         q, p = self.scales[:d], self.scales[d:]
-        action = np.exp(np.mean(np.log(q * p)))
-        ratio = np.sqrt(q / p)
+        action, ratio = np.exp(np.mean(np.log(q * p))), np.sqrt(q / p)
         return Scaling(tuple(np.sqrt(action) * ratio), tuple(np.sqrt(action) / ratio), self.time_scale)
 
     def scaled(self, scaling: Scaling) -> Trajectories:
@@ -267,8 +269,7 @@ class Trajectories(Shown):
             if none is not None and none[i]:
                 continue
             rows = [run.y[i][np.isfinite(run.y[i])] for run in self.runs]
-            steps = np.concatenate([np.diff(row) for row in rows])
-            spread = float(np.ptp(np.concatenate(rows)))
+            steps, spread = np.concatenate([np.diff(row) for row in rows]), float(np.ptp(np.concatenate(rows)))
             for text, P in ANGLES.items():
                 size = np.abs(steps) / P
                 jumps = size > JUMP

@@ -24,8 +24,7 @@ RADIUS = 0.1  # Radius of a domain around a trajectory, in the spread of each co
 
 def unseen(states: np.ndarray, errors: np.ndarray, columns: Sequence[int], part: Part | None = None) -> list[sp.Expr]:
     """Functions of some coordinates that are the same at all states: linear ones, or else quadratic ones."""
-    d = states.shape[1] // 2
-    x = states[:, [*columns]].T
+    d, x = states.shape[1] // 2, states[:, [*columns]].T
     names = [sp.Symbol(f"{'qp'[i // d]}{i % d + 1}", real=True) for i in columns]
     low, high = x.min(axis=1), x.max(axis=1)
     middle, half = (low + high) / 2, np.maximum((high - low) / 2, 1e-9 * np.abs(x).max(axis=1) + np.finfo(float).tiny)

@@ -76,8 +76,7 @@ def check_problem(reference: object, system: HamiltonianSystem, t0: float, y0: n
     if states.shape[:-1] != y0.shape or not system.keeps_energy:
         return  # the shape is refused where it is needed
     with np.errstate(all="ignore"):
-        H0 = to_numpy(system.hamiltonian(y0))
-        H = to_numpy(system.hamiltonian(np.moveaxis(states, -1, 0)))
+        H0, H = to_numpy(system.hamiltonian(y0)), to_numpy(system.hamiltonian(np.moveaxis(states, -1, 0)))
         scale = np.maximum(np.abs(H0), np.abs(y0 * to_numpy(system.gradient(y0))).sum(-1))
         off = np.abs(H - H0).max(0) > OTHER_ENERGY * scale
     if np.all(off):
@@ -91,8 +90,7 @@ def _same_field(sol: Solution, system: HamiltonianSystem) -> bool:
     y = to_numpy(sol.y).astype(float)
     states = np.moveaxis(y, -2, -1).reshape(-1, y.shape[-2])
     every = max(1, len(states) // SAMPLED)
-    t = np.broadcast_to(sol.t, (*y.shape[:-2], len(sol.t))).reshape(-1)[::every]
-    states = states[::every]
+    t, states = np.broadcast_to(sol.t, (*y.shape[:-2], len(sol.t))).reshape(-1)[::every], states[::every]
     with np.errstate(all="ignore"):
         mine, other = (to_numpy(s.vector_field(states, t)) for s in (system, sol.system))
     scale = weights(system)

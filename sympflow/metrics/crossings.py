@@ -58,10 +58,8 @@ def stroboscopic(
 ) -> Crossings:
     """The states (n, 2d) at t0 + k·T of trajectories from `rows` (N, 2d), ends of fixed steps T/m, else outputs."""
     t0, t1 = t_span
-    n = whole_periods(t_span, period)
-    turn = float(np.copysign(period, t1 - t0))
-    single = len(rows) == 1
-    y0 = rows[0] if single else rows
+    n, turn = whole_periods(t_span, period), float(np.copysign(period, t1 - t0))
+    y0 = rows[0] if len(rows) == 1 else rows
     if isinstance(integrator, FixedStep) and integrator.on_grid and not integrator.trained:
         integrator = replace(integrator, dt=dividing_step(period, integrator.step_length(system)))
     times = t0 + turn * np.arange(n + 1)

@@ -35,6 +35,9 @@ class Elements(NamedTuple):
     peri: np.ndarray
     M: np.ndarray
 
+    def __getitem__(self, name: Any) -> Any:
+        return getattr(self, name) if isinstance(name, str) else tuple.__getitem__(self, name)
+
 
 def elements(solution: Solution | ArrayLike, system: HamiltonianSystem | None = None, about: str = "star") -> Elements:
     """Return the osculating orbital elements of planets.

@@ -58,9 +58,12 @@ def max_energy_error(sol: Solution, relative: bool = True) -> np.floating | np.n
     It is inf for a trajectory that became non-finite or could not be continued, however few of its outputs were stored
     before: a blow-up never looks small.
     """
-    error = np.abs(energy_error(sol, relative))
-    worst = np.where(np.isnan(error), np.inf, error).max(axis=-1, initial=0.0)
-    return np.where(failed(sol), np.inf, worst)[()]
+    return largest(np.abs(energy_error(sol, relative)), sol)[()]
+
+
+def largest(series: np.ndarray, sol: Solution) -> np.ndarray:
+    """Maxima over time of a non-negative series, inf for trajectories that failed."""
+    return np.where(failed(sol), np.inf, np.where(np.isnan(series), np.inf, series).max(axis=-1, initial=0.0))
 
 
 def failed(sol: Solution) -> np.ndarray:
@@ -120,8 +123,7 @@ def energy_drift(sol: Solution, blocks: int = MIN_BLOCKS, relative: bool = True)
         raise TypeError(f"`blocks` must be an integer; got {blocks!r}. Use {MIN_BLOCKS} or more.")
     if blocks < MIN_BLOCKS:
         raise ValueError(f"`blocks` must be at least {MIN_BLOCKS} for a meaningful standard error; got {blocks}.")
-    n = len(sol.t)
-    lost = failed(sol)
+    n, lost = len(sol.t), failed(sol)
     if n < blocks and not lost.all():
         raise ValueError(f"`sol` has {n} outputs, fewer than the {blocks} blocks of the fit: ask for more by `t_eval`.")
     batch = sol.y.shape[:-2]
@@ -220,6 +222,5 @@ def energy_growth(sol: Solution, first: float = 1000.0) -> EnergyGrowth:
     scatter = y - y.mean() - exponent * x
     exponent_error = float(np.sqrt(scatter @ scatter / max(1, len(x) - 2) / (x @ x)))
     slopes = error @ n / (n @ n)
-    several = len(slopes) > 1
-    drift_error = float(slopes.std(ddof=1) / np.sqrt(len(slopes))) if several else np.inf
+    drift_error = float(slopes.std(ddof=1) / np.sqrt(len(slopes))) if len(slopes) > 1 else np.inf
     return EnergyGrowth(steps, rms, exponent, exponent_error, float(slopes.mean()), drift_error)

@@ -119,15 +119,13 @@ def extended_system(system: HamiltonianSystem) -> HamiltonianSystem | None:
 
 def _quadrature(sol: Solution) -> np.ndarray:
     """∫ ∂H/∂t dt along the executed steps, at the outputs."""
-    system, integrator = sol.system, sol.integrator
-    batch = to_numpy(sol.y0).shape[:-1]
+    system, integrator, batch = sol.system, sol.integrator, to_numpy(sol.y0).shape[:-1]
     direction = 1 if sol.t_span[1] >= sol.t_span[0] else -1
     work, total, done = np.zeros((len(sol.t), *batch)), np.zeros(batch), 0
     for times, states, lengths in integrator.steps(system, sol.t_span, sol.y0):
         y = to_numpy(states).astype(float)
         t, h = (np.broadcast_to(x.reshape(-1, *[1] * len(batch)), y.shape[:-1]) for x in (times, lengths))
-        steps = _along(sol, t, y, h)
-        running = total + np.concatenate([np.zeros((1, *batch)), np.cumsum(steps, axis=0)])
+        running = total + np.concatenate([np.zeros((1, *batch)), np.cumsum(_along(sol, t, y, h), axis=0)])
         ends = times + lengths
         due = done + int(np.searchsorted(direction * sol.t[done:], direction * ends[-1], side="right"))
         if due > done:

@@ -107,8 +107,7 @@ def escape_times(
     """
     system = given_system(system)
     orbits = checked_orbits(system, method, t_span, y0, options, "escapes are located on")
-    region = region_of(outside, system)
-    rows = orbits.rows
+    region, rows = region_of(outside, system), orbits.rows
     _inside(region, rows[:1])
     time, state, status = escapes(orbits, region, backend)
     message = FINISHED
@@ -175,8 +174,7 @@ def _escapes(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     system, (t0, t1) = orbits.system, orbits.t_span
     time, state = np.full(len(rows), np.inf), np.full(rows.shape, np.nan)
-    status = np.zeros(len(rows), dtype=np.int64)
-    began = ~_inside(region, rows)
+    status, began = np.zeros(len(rows), dtype=np.int64), ~_inside(region, rows)
     time[began], state[began], status[began] = t0, rows[began], 1
     where = np.flatnonzero(~began)
     y = rows[where]
@@ -196,11 +194,9 @@ def _escapes(
             finite = np.isfinite(states).all(-1)
             left = ~finite
             left[finite] = ~_inside(region, states[finite])
-            gone = left.any(0)
-            first = np.argmax(left, axis=0)
+            gone, first = left.any(0), np.argmax(left, axis=0)
             lanes = np.flatnonzero(gone)
-            before = states[first[lanes] - 1, lanes]
-            escaped = finite[first[lanes], lanes]
+            before, escaped = states[first[lanes] - 1, lanes], finite[first[lanes], lanes]
             status[where[lanes]] = np.where(escaped, 1, -1)
             time[where[lanes]] = np.nan
             found = where[lanes[escaped]]

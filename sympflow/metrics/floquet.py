@@ -145,8 +145,7 @@ def floquet_multipliers(
         )
     t_span = (float(t0), float(t0 + T))
     end = solve(system, integrator, t_span, start, t_eval=[t_span[1]]).raise_for_status().y[:, -1]
-    mismatch = float(np.linalg.norm(to_numpy(end) - start))
-    scale = weights(system)
+    mismatch, scale = float(np.linalg.norm(to_numpy(end) - start)), weights(system)
     sizes = [float(np.abs(scale * y).max()) for y in (start, system.y0) if y is not None]
     if not np.linalg.norm(scale * (to_numpy(end) - start)) <= CLOSED * (max(sizes) or 1.0):
         warn(

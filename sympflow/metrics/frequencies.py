@@ -213,9 +213,6 @@ def signals(signal: Signal, y: np.ndarray, m: int) -> np.ndarray:
     return z.astype(complex)
 
 
-# the analysis ---------------------------------------------------------------------------------------
-
-
 def lines(z: np.ndarray, times: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
     """The frequencies and amplitudes (N, c, n) of the n strongest lines of signals (N, c, m) at equidistant times."""
     found = [_lines_of(row, n) for row in z.reshape(-1, z.shape[-1])]  # by itself: the same in any batch
@@ -227,15 +224,13 @@ def lines(z: np.ndarray, times: np.ndarray, n: int) -> tuple[np.ndarray, np.ndar
 
 def _lines_of(z: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
     """Angles per sample and amplitudes, in the middle, of the lines of one signal (m,)."""
-    m = len(z)
-    angles, amplitudes = np.full(n, np.nan), np.full(n, np.nan + 0j)
+    m, angles, amplitudes = len(z), np.full(n, np.nan), np.full(n, np.nan + 0j)
     if not np.isfinite(z).all():
         return angles, amplitudes
     s = np.arange(m) - (m - 1) / 2
     window = 1 + np.cos(2 * np.pi * s / (m - 1))
     window /= window.sum()
-    basis = np.empty((0, m), dtype=complex)
-    rest, strength = z, float(np.abs(z).max())
+    basis, rest, strength = np.empty((0, m), dtype=complex), z, float(np.abs(z).max())
     for k in range(n):
         angle = _refined(rest, window, s, _start(rest, window))
         basis = np.concatenate([basis, np.exp(1j * angle * s)[None]])

@@ -80,8 +80,7 @@ class LinearStability:
     @property
     def intervals(self) -> tuple[tuple[float, float], ...]:
         """The intervals (from, to) of stability, in order."""
-        starts = [0.0, *(w.stop for w in self.windows)]
-        stops = [*(w.start for w in self.windows), math.inf]
+        starts, stops = [0.0, *(w.stop for w in self.windows)], [*(w.start for w in self.windows), math.inf]
         return tuple((a, b) for a, b in zip(starts, stops, strict=True) if a < b)
 
     def window_of(self, step: float) -> Window | None:
@@ -185,9 +184,6 @@ def _windows(p: Polynomial, points: list[Decimal], values: list[Decimal]) -> tup
     return tuple(windows)
 
 
-# polynomials ----------------------------------------------------------------------------------------------------------
-
-
 def half_trace(scheme: Scheme) -> tuple[Fraction, ...]:
     """Return the coefficients of the stability polynomial ½ tr in x = z², exactly as the table has them.
 
@@ -247,8 +243,7 @@ def _positive_roots(p: Polynomial) -> list[Decimal]:
 
 def _crossing(p: Polynomial, level: Decimal, a: Decimal, b: Decimal) -> Decimal:
     """The x between a and b where p, monotone there, passes a level, to half of the digits."""
-    rising = series.polyval(b, p) > series.polyval(a, p)
-    slope = series.polyder(p)
+    rising, slope = series.polyval(b, p) > series.polyval(a, p), series.polyder(p)
     x = (a + b) / 2
     while b - a > b * Decimal(10) ** (-DIGITS // 2):
         off, steep = series.polyval(x, p) - level, series.polyval(x, slope)
@@ -258,9 +253,6 @@ def _crossing(p: Polynomial, level: Decimal, a: Decimal, b: Decimal) -> Decimal:
             return newton
         x = newton if a < newton < b and abs(newton - x) < (b - a) / 4 else (a + b) / 2
     return (a + b) / 2
-
-
-# systems --------------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -346,8 +338,7 @@ def _frequencies(system: HamiltonianSystem, y: np.ndarray) -> np.ndarray:
 
 def _quadratic(system: HamiltonianSystem, y0: np.ndarray) -> bool:
     """True if the Hessian of H is the same at states of all sizes."""
-    rng = np.random.default_rng(0)
-    scale = weights(system)
+    rng, scale = np.random.default_rng(0), weights(system)
     size = float(np.abs(scale * y0).max()) or 1.0
     states = np.concatenate([size * s * rng.standard_normal((8, y0.size)) / scale for s in SCALES])
     hessians = np.asarray(system.hessian(states)) / np.outer(scale, scale)
@@ -395,8 +386,7 @@ def _growth(integrator: Integrator, system: HamiltonianSystem, y: np.ndarray, st
 
 def _found(growth: np.ndarray, steps: np.ndarray, at: Callable[[np.ndarray], np.ndarray]) -> list[Window]:
     """The windows in a list of steps, their ends by bisection."""
-    bad = np.concatenate([[False], growth > 1 + GROWS])
-    grid = np.concatenate([[0.0], steps])
+    bad, grid = np.concatenate([[False], growth > 1 + GROWS]), np.concatenate([[0.0], steps])
     edges = np.flatnonzero(bad[1:] != bad[:-1])
     low, high = grid[edges], grid[edges + 1]
     for _ in range(30):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -82,7 +83,8 @@ def _kahan_li(system: HamiltonianSystem, t_span: Any, y0: np.ndarray, t: np.ndar
     dt = 4 * system.dt
     previous, best, apart = None, None, math.inf
     for _ in range(_HALVINGS):
-        sol = solve(system, "kahan_li8", t_span, y0, t_eval=t, dt=dt)
+        with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # of steps that are too long at first
+            sol = solve(system, "kahan_li8", t_span, y0, t_eval=t, dt=dt)
         y = to_numpy(sol.y) if sol.y.shape[-1] == len(t) else None
         if y is not None and previous is not None:
             size = distance(system, np.where(np.isfinite(y), y, 0.0), axis=-2).max(initial=0.0)
@@ -125,8 +127,7 @@ def _linear_flow(system: HamiltonianSystem, t: np.ndarray, y0: np.ndarray) -> np
         return None
     import sympy
 
-    variables = [*system.written.q, *system.written.p]
-    H = system.written.H
+    variables, H = [*system.written.q, *system.written.p], system.written.H
     if not H.is_polynomial(*variables) or any(sum(m) not in (0, 2) for m in sympy.Poly(H, *variables).monoms()):
         return None
     S = np.asarray(system.hessian(np.zeros(len(variables))))

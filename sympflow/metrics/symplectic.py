@@ -52,10 +52,8 @@ def volume_error(sol: Solution, over_time: bool = False) -> np.floating | np.nda
     _check_kept(sol, "volume")
     if sol.varied:
         return gathered(sol, lambda part: volume_error(part, over_time))
-    batch = sol.y.shape[:-2]
-    lost = failed(sol)
-    total = np.zeros(batch)
-    series = np.zeros((len(sol.t), *batch))
+    batch, lost = sol.y.shape[:-2], failed(sol)
+    total, series = np.zeros(batch), np.zeros((len(sol.t), *batch))
     direction = 1 if sol.t_span[1] >= sol.t_span[0] else -1
     first_fold = None
     n_steps = 0
@@ -100,8 +98,7 @@ def _hold(series: np.ndarray, ends: np.ndarray, values: np.ndarray, t: np.ndarra
         series[index > 0] = values[index[index > 0] - 1]
         return
     for end, value in zip(ends, values, strict=True):
-        passed = (t + tolerance).reshape(-1, *[1] * end.ndim) >= end
-        np.copyto(series, value, where=passed)
+        np.copyto(series, value, where=(t + tolerance).reshape(-1, *[1] * end.ndim) >= end)
 
 
 def symplecticity_defect(
@@ -186,8 +183,7 @@ def symplecticity_estimate(sol: Solution, directions: int = 8, seed: int = 0) ->
     d = system.ndof
     U = torch.from_numpy(np.random.default_rng(seed).standard_normal((directions, 2 * d)))
     i, j = np.triu_indices(directions, 1)
-    worst = np.zeros(sol.y.shape[:-2])
-    error = np.zeros(sol.y.shape[:-2])
+    worst, error = np.zeros(sol.y.shape[:-2]), np.zeros(sol.y.shape[:-2])
     for times, states, lengths in integrator.steps(system, sol.t_span, sol.y0):
         for t, y, h in zip(times, to_numpy(states), lengths, strict=True):
             x, step = torch.tensor(y), torch.as_tensor(h)
@@ -198,8 +194,7 @@ def symplecticity_estimate(sol: Solution, directions: int = 8, seed: int = 0) ->
 
             moved = [to_numpy(jvp(one_step, x, v.expand_as(x))[1]) for v in u]
             before = _form(u.numpy()[i], u.numpy()[j]).reshape(-1, *[1] * (y.ndim - 1))
-            change = _form(np.stack(moved)[i], np.stack(moved)[j]) - before
-            squares = change.astype(float) ** 2 / (2 * d)
+            squares = (_form(np.stack(moved)[i], np.stack(moved)[j]) - before).astype(float) ** 2 / (2 * d)
             mean = np.where(np.isfinite(squares).all(0), squares.mean(0), np.inf)
             value = np.sqrt(mean)
             with np.errstate(all="ignore"):

@@ -12,22 +12,11 @@ import dis
 import functools
 import hashlib
 import sys
+import types
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
-from types import (
-    BuiltinFunctionType,
-    CodeType,
-    FunctionType,
-    GetSetDescriptorType,
-    MappingProxyType,
-    MemberDescriptorType,
-    MethodDescriptorType,
-    MethodType,
-    ModuleType,
-    WrapperDescriptorType,
-)
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -35,7 +24,12 @@ import numpy as np
 from sympflow.arrays import is_tensor
 
 PLAIN = (type(None), bool, int, float, complex, str, bytes, type(Ellipsis), type(NotImplemented))
-NAMED = (GetSetDescriptorType, MemberDescriptorType, MethodDescriptorType, WrapperDescriptorType)
+NAMED = (
+    types.GetSetDescriptorType,
+    types.MemberDescriptorType,
+    types.MethodDescriptorType,
+    types.WrapperDescriptorType,
+)
 GLOBALS, ATTRIBUTES = ("LOAD_GLOBAL", "LOAD_NAME"), ("LOAD_ATTR", "LOAD_METHOD", "IMPORT_FROM")
 
 
@@ -102,7 +96,7 @@ class _Contents:
             return self._array(np.asarray(value))
         if is_tensor(value):
             return "tensor", str(value.dtype), *self._array(_numbers(value))
-        if kind in (dict, OrderedDict, MappingProxyType):
+        if kind in (dict, OrderedDict, types.MappingProxyType):
             return "mapping", *self._items(value.items())
         if kind in (list, tuple):
             return kind.__name__, *map(self.of, value)
@@ -122,12 +116,12 @@ class _Contents:
     def _python(self, value: Any) -> Iterable[str]:
         """The parts of what Python code stands for, and of objects of any other kind."""
         self.python = True
-        if isinstance(value, CodeType):
+        if isinstance(value, types.CodeType):
             own = (value.co_code, value.co_exceptiontable, value.co_flags, value.co_argcount, value.co_kwonlyargcount)
             return "code", *map(self.of, (*own, value.co_names, value.co_varnames, value.co_consts))
-        if isinstance(value, FunctionType):
+        if isinstance(value, types.FunctionType):
             return self._function(value)
-        if isinstance(value, MethodType):
+        if isinstance(value, types.MethodType):
             return "method", self.of(value.__func__), self.of(value.__self__)
         if isinstance(value, staticmethod | classmethod):
             return type(value).__name__, self.of(value.__func__)
@@ -141,10 +135,14 @@ class _Contents:
             return "compiled", self.of(value.py_func), self.of(dict(value.targetoptions))
         if isinstance(value, NAMED):
             return "member", _name(value.__objclass__), value.__name__
-        if isinstance(value, BuiltinFunctionType):
-            owner = value.__self__
-            return "built in", _name(value), "" if owner is None or isinstance(owner, ModuleType) else self.of(owner)
-        if isinstance(value, ModuleType):
+        if isinstance(value, types.BuiltinFunctionType):
+            that = value.__self__
+            return (
+                "built in",
+                _name(value),
+                "" if that is None or isinstance(that, types.ModuleType) else self.of(that),
+            )
+        if isinstance(value, types.ModuleType):
             return ("module", value.__name__) if _source(value.__name__) is not None else (self._unknown(value),)
         return self._object(value)
 
@@ -167,7 +165,7 @@ class _Contents:
             made = value.__reduce_ex__(4) if reduce is None else reduce(value)
         except Exception:  # whatever its class raises
             wrapped = getattr(value, "__wrapped__", None)
-            return ("wrapped", self.of(wrapped)) if isinstance(wrapped, FunctionType) else (self._unknown(value),)
+            return ("wrapped", self.of(wrapped)) if isinstance(wrapped, types.FunctionType) else (self._unknown(value),)
         if isinstance(made, str):
             if isinstance(value, np.ufunc) and value not in (getattr(np, made, None), _of("scipy.special", made)):
                 return (self._unknown(value),)
@@ -189,7 +187,7 @@ class _Contents:
         members = ((name, value) for name, value in vars(cls).items() if callable(value) or name not in said)
         return "class", cls.__qualname__, *map(self.of, (type(cls), *cls.__bases__)), *self._items(members)
 
-    def _function(self, f: FunctionType) -> Iterable[str]:
+    def _function(self, f: types.FunctionType) -> Iterable[str]:
         made_with = (f.__code__, f.__defaults__, f.__kwdefaults__)
         attributes = {name for code in _codes(f.__code__) for name in _looked_up(code, ATTRIBUTES)}
         source = _source(f.__module__)
@@ -202,7 +200,7 @@ class _Contents:
 
     def _reached(self, value: Any, attributes: frozenset[str]) -> str:
         """The digest of what a function names; of a module of the user, of those of its attributes that are named."""
-        if not isinstance(value, ModuleType) or _source(value.__name__) is not None:
+        if not isinstance(value, types.ModuleType) or _source(value.__name__) is not None:
             return self.of(value)
         if id(value) in self._open:
             return _digest("again", value.__name__)
@@ -214,8 +212,8 @@ class _Contents:
 
     def _unknown(self, value: Any) -> str:
         self.python = True
-        name = value.__name__ if isinstance(value, ModuleType) else _name(type(value)).removeprefix("builtins.")
-        self.untold.append(f"the module {name}" if isinstance(value, ModuleType) else f"an object of {name}")
+        name = value.__name__ if isinstance(value, types.ModuleType) else _name(type(value)).removeprefix("builtins.")
+        self.untold.append(f"the module {name}" if isinstance(value, types.ModuleType) else f"an object of {name}")
         return _digest("unknown", name)
 
 
@@ -269,19 +267,19 @@ def _source(module: str | None) -> str | None:
         return ""
 
 
-def _codes(code: CodeType) -> Iterator[CodeType]:
+def _codes(code: types.CodeType) -> Iterator[types.CodeType]:
     """A code, and those of functions within it."""
     yield code
     for inner in code.co_consts:
-        if isinstance(inner, CodeType):
+        if isinstance(inner, types.CodeType):
             yield from _codes(inner)
 
 
-def _looked_up(code: CodeType, operations: Iterable[str]) -> list[str]:
+def _looked_up(code: types.CodeType, operations: Iterable[str]) -> list[str]:
     return [step.argval for step in dis.get_instructions(code) if step.opname in operations]
 
 
-def _globals(f: FunctionType) -> Iterator[tuple[str, Any]]:
+def _globals(f: types.FunctionType) -> Iterator[tuple[str, Any]]:
     """The globals that a function names, and the modules that it imports."""
     codes = list(_codes(f.__code__))
     space: Mapping[str, Any] = f.__globals__
@@ -293,7 +291,7 @@ def _globals(f: FunctionType) -> Iterator[tuple[str, Any]]:
             yield name, module
 
 
-def _closure(f: FunctionType) -> Iterator[tuple[str, Any]]:
+def _closure(f: types.FunctionType) -> Iterator[tuple[str, Any]]:
     for name, cell in zip(f.__code__.co_freevars, f.__closure__ or (), strict=True):
         try:
             yield name, cell.cell_contents

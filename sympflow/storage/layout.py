@@ -67,9 +67,6 @@ def imported(library: str, what: str) -> Any:
         raise ImportError(f"{what} needs {library}: {needed(library, 'data')}.") from error
 
 
-# tables --------------------------------------------------------------------------------------------------------------
-
-
 def table(data: xarray.Dataset, rows: Iterable[str]) -> pandas.DataFrame:
     """The arrays of a Dataset as columns, q1 … qd along `dof`, else name_0, …, a row for each index along `rows`."""
     pd = imported("pandas", "to_dataframe()")

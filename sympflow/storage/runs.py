@@ -84,8 +84,6 @@ class RunStore:
         self.project: Callable[[Any], Any] = _itself
         self.look: Callable[[np.ndarray, np.ndarray], None] = _nothing
 
-    # opening --------------------------------------------------------------------------------------
-
     def prepare(self, known: Known, attributes: Mapping[str, Any], y0: np.ndarray, n_outputs: int) -> None:
         """Take what the store is to be made of."""
         self.attributes = dict(attributes)
@@ -143,8 +141,6 @@ class RunStore:
         values |= {f"{letter}0": y0[..., rows] for letter, rows in halves(d)}
         return Store.create(self.path, made, told, values)
 
-    # what is in it --------------------------------------------------------------------------------
-
     @property
     def length(self) -> int:
         return self.appender.length
@@ -199,8 +195,6 @@ class RunStore:
                 whole[(..., *rows, slice(a + skip - first, a - first + part.shape[-1]))] = part[..., skip:]
             row += fields[name].shape[-2] if width else 0
         return whole
-
-    # writing --------------------------------------------------------------------------------------
 
     def truncate(self, length: int) -> None:
         """Leave out the last outputs, as those of an end that is no longer one."""

@@ -169,8 +169,7 @@ class Store:
             found = json.loads(_read(place / METADATA, MOST_METADATA))["metadata"]
             names = [key.removesuffix(f"/{ARRAY}") for key in found if key.endswith(f"/{ARRAY}")]
             fields = {name: Field.read(found[f"{name}/{ARRAY}"], found[f"{name}/{ATTRIBUTES}"]) for name in names}
-            attributes = dict(found[ATTRIBUTES])
-            strange = [name for name in names if not is_name(name)]
+            attributes, strange = dict(found[ATTRIBUTES]), [name for name in names if not is_name(name)]
             if strange or not STATE.fullmatch(attributes.get(KEPT, ".state-1.npz")):
                 raise ValueError(f"a path in place of a name, {(strange or [attributes.get(KEPT)])[0]!r}")
             with os.scandir(place) as entries:
@@ -223,8 +222,6 @@ class Store:
         """Return the error that says what is wrong with the store."""
         return StoreError(f"`store` {str(self.path)!r} is damaged: {why}. Give another place, or a copy of it.")
 
-    # chunks ---------------------------------------------------------------------------------------
-
     def _file(self, name: str, index: tuple[int, ...]) -> Path:
         return self.path / name / (".".join(map(str, index)) or "0")
 
@@ -234,8 +231,7 @@ class Store:
 
     def write(self, name: str, index: tuple[int, ...], values: np.ndarray) -> None:
         """Write one chunk, into which `values` must fit; at the edge of the array they may be smaller."""
-        known = self.fields[name]
-        values = np.asarray(values)
+        known, values = self.fields[name], np.asarray(values)
         if values.ndim != len(known.chunks) or (np.array(values.shape) > known.chunks).any():
             raise ValueError(f"`values` of shape {values.shape} are not a chunk of {name!r}, of shape {known.chunks}.")
         if values.shape == known.chunks:
@@ -278,8 +274,6 @@ class Store:
             raise self.damaged(f"{self._file(name, index).name} of {name!r} is missing")
         return self.read(name, index)
 
-    # commits --------------------------------------------------------------------------------------
-
     def commit(
         self,
         lengths: Mapping[str, int] | None = None,
@@ -291,8 +285,7 @@ class Store:
         for name, known in fields.items():
             shape = tuple(lengths.get(dim, n) for dim, n in zip(known.dims, known.shape, strict=True))
             fields[name] = replace(known, shape=shape)
-        changed = self.attributes | dict(attributes or {})
-        before = self.attributes.get(KEPT)
+        changed, before = self.attributes | dict(attributes or {}), self.attributes.get(KEPT)
         with _told(self.path):
             if state is not None:
                 last = STATE.fullmatch(before or "")
@@ -369,8 +362,7 @@ class Appender:
         self.held = self.length % self.size
         if self.held:  # the last chunk, up to what was committed
             for name in self.axes:
-                index = self._index(name, self.length // self.size)
-                self.tails[name].append(store.committed(name, index))
+                self.tails[name].append(store.committed(name, self._index(name, self.length // self.size)))
 
     def _index(self, name: str, k: int) -> tuple[int, ...]:
         """The chunk k along the dimension; along the others there is one."""

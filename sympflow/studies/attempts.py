@@ -20,7 +20,7 @@ import numpy as np
 from sympflow.integrators.base import FixedStep, Integrator
 from sympflow.integrators.registry import build, name_of, naming_plugin
 from sympflow.metrics.accuracy import reference_error, time_reversal_error
-from sympflow.metrics.energy import energy_drift, energy_error, failed, max_energy_error
+from sympflow.metrics.energy import energy_drift, energy_error, failed, largest, max_energy_error
 from sympflow.metrics.energy_balance import energy_balance_error
 from sympflow.metrics.reference import Reference
 from sympflow.metrics.symplectic import conformal_defect, symplecticity_defect, volume_error
@@ -373,12 +373,6 @@ class Attempt:
         for message in dict.fromkeys(str(w.message) for w in caught if issubclass(w.category, RuntimeWarning)):
             if message not in self.row.reason:
                 self.note(message)
-
-
-def largest(series: np.ndarray, sol: Solution) -> np.ndarray:
-    """Maxima over time of a non-negative series, inf for trajectories that failed."""
-    worst = np.where(np.isnan(series), np.inf, series).max(axis=-1, initial=0.0)
-    return np.where(failed(sol), np.inf, worst)
 
 
 # metrics ----------------------------------------------------------------------------------------------------------

@@ -247,8 +247,6 @@ def _errors(
     return truth
 
 
-# methods matched to each other ----------------------------------------------------------------------------------
-
 _CLOSE = math.log(1.05)
 _LONGEST_JUMP = math.log(16.0)
 _ROUNDS = 12
@@ -337,9 +335,6 @@ def matched(
             margin = 0.05 * (above[0] - below[0])
             x = min(max(x, below[0] + margin), above[0] - margin)
     return best[1], best[2]
-
-
-# the report -------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, repr=False)
@@ -434,8 +429,7 @@ class Comparison(Report):
 
 def combined_table(comparisons: Sequence[Comparison], width: int | None = None) -> str:
     """The rows of several comparisons as one table; the methods as columns where `width` does not hold it."""
-    rows = [row for c in comparisons for row in c.rows]
-    several = len(comparisons) > 1
+    rows, several = [row for c in comparisons for row in c.rows], len(comparisons) > 1
     names = [c.title for c in comparisons for _ in c.rows]
     first = [i == 0 for c in comparisons for i in range(len(c.rows))]
     systems = [n if f and several else "" for n, f in zip(names, first, strict=True)]

@@ -162,8 +162,7 @@ def _dash(run: Attempt) -> str:
 
 
 def _drawable(comparison: Compared) -> tuple[str, ...]:
-    ran = any(run.sol is not None for run in comparison.runs)
-    return (*_panels(comparison), *(("portrait",) if ran else ()))
+    return (*_panels(comparison), *(("portrait",) if any(run.sol is not None for run in comparison.runs) else ()))
 
 
 def _panels(comparison: Compared) -> tuple[str, ...]:
@@ -248,8 +247,7 @@ def _overlap(one: tuple[np.ndarray, np.ndarray], other: tuple[np.ndarray, np.nda
 
 def portrait(comparison: Compared) -> Figure:
     """Phase space, a panel for each method with the reference in grey: (q, p), the section q₁ = 0, or q₁ against q₂."""
-    system = comparison.system
-    runs = [run for run in comparison.runs if run.sol is not None]
+    system, runs = comparison.system, [run for run in comparison.runs if run.sol is not None]
     rows = -(-len(runs) // 5)
     columns = -(-len(runs) // rows)
     figure = new_figure(0.5 + 2.5 * columns, 0.5 + 2.7 * rows)
@@ -282,8 +280,7 @@ def portrait(comparison: Compared) -> Figure:
 def _phase_points(comparison: Compared, integrator: Any) -> np.ndarray:
     """The points of one run that a portrait shows, (m, 2)."""
     system = comparison.system
-    starts = to_numpy(comparison.y0).reshape(-1, 2 * system.ndof)
-    period = _period(comparison)
+    starts, period = to_numpy(comparison.y0).reshape(-1, 2 * system.ndof), _period(comparison)
     if period is not None:
         return stroboscopic(integrator, system, comparison.t_span, starts, period).states[:, [0, system.ndof]]
     if system.ndof == 2:

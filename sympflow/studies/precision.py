@@ -165,9 +165,6 @@ def measure_of(system: HamiltonianSystem) -> str:
 _KEPT: dict[str, attempts.Metric] = {"energy_error": attempts.energy, "balance_error": attempts.balance}
 
 
-# the points -----------------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class Conditions:
     """One set of initial states, the interval and the instants, under which every point is run."""
@@ -189,8 +186,7 @@ class Conditions:
 
     def run(self, integrator: Any, t_span: tuple[float, float] | None = None, t: np.ndarray | None = None) -> Solution:
         """The solution from all initial states, or of a method that takes them one by one from a few."""
-        few = integrator.one_by_one and self.trajectories > SAMPLE
-        y0 = self.y0[:SAMPLE] if few else self.y0
+        y0 = self.y0[:SAMPLE] if integrator.one_by_one and self.trajectories > SAMPLE else self.y0
         times = self.t if t is None else t
         return solve(self.system, integrator, t_span or self.t_span, y0, t_eval=times, backend=self.backend)
 
@@ -265,9 +261,6 @@ def _first(candidate: Candidate, conditions: Conditions, compile_time: float | N
 SETTINGS = ("dt", "tolerance")  # settings of a method: the largest that reaches an error is the cheapest
 
 
-# read off the points --------------------------------------------------------------------------------------------------
-
-
 def break_even(points: list[Row], length: float, measure: str = "energy_error") -> list[Row]:
     """Fill in when the training of each flow has paid for itself, for runs over an interval of that length."""
     done = [p for p in points if p.run_time and math.isfinite(_figure(p, measure))]
@@ -275,8 +268,7 @@ def break_even(points: list[Row], length: float, measure: str = "energy_error") 
     filled = []
     for point in points:
         if point in done and point.training_time is not None and untrained:
-            labels = {p.label for p in untrained}
-            error = _figure(point, measure)
+            labels, error = {p.label for p in untrained}, _figure(point, measure)
             rival = min(cost_at([p for p in untrained if p.label == n], error, measure=measure) for n in labels)
             if math.isinf(rival):  # no untrained point is as accurate: nothing to compare with
                 reason = "No break-even: no untrained method was run at a step that reaches this error."
@@ -305,9 +297,6 @@ def cost_at(points: Sequence[Row], error: float, cost: str = "run_time", measure
             share = math.log(error / e0) / math.log(e1 / e0)
             enough = best(enough, c0 * (c1 / c0) ** share)
     return enough
-
-
-# the report -----------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, repr=False)

@@ -75,9 +75,6 @@ def described(system: HamiltonianSystem) -> dict[str, Any]:
     }
 
 
-# text -------------------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class Column:
     """A column of a text table: its title, and its cells as strings."""
@@ -127,9 +124,6 @@ def seconds(x: float | None) -> str:
         if x >= size:
             return f"{x / size:.3g} {unit}" if x / size < 1000 else f"{x / size:.0f} {unit}"
     return f"{x * 1e9:.3g} ns"
-
-
-# files ------------------------------------------------------------------------------------------------------------
 
 
 def write_csv(rows: Sequence[Any], path: str | os.PathLike[str], columns: Sequence[str] | None = None) -> Path:

@@ -750,8 +750,7 @@ class StabilityReport(Report):
         ]
 
     def _names(self, rows: Sequence[Row | StepLimit]) -> list[Column]:
-        several = len(self.systems) > 1
-        precisions = {r.dtype for r in rows}
+        several, precisions = len(self.systems) > 1, {r.dtype for r in rows}
         return [
             Column("system", [r.system if several else "" for r in rows], left=True),
             Column("method", [r.label for r in rows], left=True),

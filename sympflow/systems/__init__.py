@@ -121,7 +121,7 @@ def register(name: str, factory: Callable[..., HamiltonianSystem]) -> None:
             "another name."
         )
     if isinstance(factory, HamiltonianSystem) or not _makes_a_default(factory):
-        raise TypeError(f"`factory` must make the system, with a default for every parameter; got {factory!r}.")
+        raise TypeError(f"`factory` must be a function that makes the system without arguments; got {factory!r}.")
     _registered[key] = factory
 
 
@@ -148,8 +148,7 @@ def _makes_a_default(factory: Any) -> bool:
         parameters = inspect.signature(factory).parameters.values()
     except (TypeError, ValueError):
         return False
-    needs = (p.default is p.empty and p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD) for p in parameters)
-    return not any(needs)
+    return not any(p.default is p.empty and p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD) for p in parameters)
 
 
 def _key(name: str) -> str:
@@ -160,6 +159,10 @@ __all__ = ["SYSTEMS", "available", "from_toml", "get", "register"]
 __all__ += ["fodo_matrices", "grid", "kepler_ellipse", "lax_eigenvalues", "magnetic_moment", "oscillatory_energies"]
 __all__ += ["perihelion_angle"]
 __all__ += [factory.__name__ for factory in SYSTEMS.values()]
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)
 
 
 for _key_of, _factory in SYSTEMS.items():

@@ -80,8 +80,7 @@ def decaying_orbit(drag: float = 0.002, e: float = 0.3) -> DoubledSystem:
     """
     checked_number("drag", drag, "positive, at most 0.003", lambda x: 0 < x <= 0.003)
     checked_number("e", e, "an eccentricity, 0 ≤ e ≤ 0.6", lambda x: 0 <= x <= 0.6)
-    orbit = kepler(e)
-    p = 1.25 * math.sqrt((1 + e) / (1 - e))
+    orbit, p = kepler(e), 1.25 * math.sqrt((1 + e) / (1 - e))
     high = np.array([1.2 * (1 + e), 1.2 * (1 + e), 0.1, 0.1, 0.1, 0.1, p, p])
     scene: dict[str, Any] = {"y0": orbit.y0, "t_span": (0.0, 10 * math.pi), "dt": 2 * math.pi / 500}
     free = HamiltonianSystem.from_sympy(orbit.symbols.H, name="kepler", **scene)
@@ -129,8 +128,7 @@ def schwarzschild(semilatus: float = 12.0, e: float = 0.5) -> HamiltonianSystem:
     E2 = ((semilatus - 2) ** 2 - 4 * e * e) / (semilatus * (semilatus - 3 - e * e))
     period = 2 * math.pi * (semilatus / (1 - e * e)) ** 1.5
     inner, outer = semilatus / (1 + e), semilatus / (1 - e)
-    widest = 21 * perihelion_angle(semilatus, e)
-    p_r = 2 * (e + 0.1) / math.sqrt(semilatus - 6 - 2 * e)
+    widest, p_r = 21 * perihelion_angle(semilatus, e), 2 * (e + 0.1) / math.sqrt(semilatus - 6 - 2 * e)
     H, near = "((1 - 2/q1)*p1**2 + p2**2/q1**2 - E2/(1 - 2/q1))/2", 0.01 / semilatus
     box = Box([0.98 * inner, -1.0, -p_r, 0.99 * L], [1.02 * outer, widest, p_r, 1.01 * L])
     scene: dict[str, Any] = {"domain": EnergySublevel(-0.5 + near, box, above=-0.5 - near), "dt": period / 500}

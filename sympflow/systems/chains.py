@@ -48,8 +48,7 @@ def fput(omega: float = 50.0, m: int = 3) -> HamiltonianSystem:
     soft = [f"({slow[0]} - {fast[0]})**4", f"({slow[-1]} + {fast[-1]})**4"]
     soft += [f"({slow[i + 1]} - {fast[i + 1]} - {slow[i]} - {fast[i]})**4" for i in range(m - 1)]
     kinetic = " + ".join(f"p{i}**2" for i in range(1, 2 * m + 1))
-    stiff = " + ".join(f"{q}**2" for q in fast)
-    y0 = np.zeros(4 * m)
+    stiff, y0 = " + ".join(f"{q}**2" for q in fast), np.zeros(4 * m)
     y0[[0, m, 2 * m, 3 * m]] = 1.0, 1 / omega, 1.0, 1.0
     high = np.repeat([1.7, 1.7 / omega, 1.7, 1.7], m)
     H = f"({kinetic})/2 + omega**2*({stiff})/2 + ({' + '.join(soft)})/4"
@@ -114,8 +113,7 @@ def lax_eigenvalues(y: Array) -> np.ndarray:
     L has p_i/2 on the diagonal and exp((q_i − q_{i+1})/2)/2 beside it and in the corners. An orbit keeps them.
     """
     q, p = np.split(to_numpy(y), 2, axis=-1)
-    n = q.shape[-1]
-    a = np.exp((q - np.roll(q, -1, axis=-1)) / 2) / 2
+    n, a = q.shape[-1], np.exp((q - np.roll(q, -1, axis=-1)) / 2) / 2
     to_next = a[..., None] * np.roll(np.eye(n), 1, axis=1)
     return np.linalg.eigvalsh(p[..., None] / 2 * np.eye(n) + to_next + to_next.swapaxes(-1, -2))
 

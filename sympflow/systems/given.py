@@ -32,10 +32,10 @@ def given_system(system: Any, params: Mapping[str, Any] | None = None) -> Hamilt
             if key in available():
                 return get(key)()
             hint = did_you_mean(key, available(), 0.5)
-            raise ValueError(
-                f"`system` {system!r} is the name of no scene.{hint} There are {', '.join(available())}; a formula "
-                "such as 'p**2/2 + q**2/2' is a system too."
+            names = (
+                "" if hint else f" There are {', '.join(available())}; a formula such as 'p**2/2 + q**2/2' is one too."
             )
+            raise ValueError(f"`system` {system!r} is the name of no scene.{hint}{names}")
         return HamiltonianSystem.from_sympy(system, params=_first(params))
     sympy = sys.modules.get("sympy")
     if sympy is not None and isinstance(system, sympy.Basic | sympy.MatrixBase):

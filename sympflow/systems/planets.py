@@ -77,8 +77,7 @@ def solar_system(planets: int | Sequence[str] = 8) -> HamiltonianSystem:
     inclination, longitude, perihelion, node = np.radians(angles)
     elements = np.stack([a, e, inclination, node, perihelion - node, longitude - perihelion], axis=-1)
     elements[:, 2:] = np.where(np.arange(4) > 0, np.mod(elements[:, 2:], 2 * np.pi), elements[:, 2:])
-    G = gravity(UNITS)
-    phases = np.repeat(elements[None], _PHASES, axis=0)
+    G, phases = gravity(UNITS), np.repeat(elements[None], _PHASES, axis=0)
     phases[..., 5] += np.linspace(0, 2 * np.pi, _PHASES, endpoint=False)[:, None]
     orbit = placed(masses, G, phases)
     n = len(masses)

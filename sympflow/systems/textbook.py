@@ -235,8 +235,7 @@ def spring_pendulum(k: float = 100.0, coordinates: str = "cartesian", radial_ene
     stretch = 2 * (speed / math.sqrt(k) + 3 * GRAVITY / k)  # at the bottom 2g(1 − cos 1) + g pull on the spring
     fast = 2 * (speed + 3 * GRAVITY / math.sqrt(k))
     if coordinates == "polar":
-        H = "p1**2/2 + k*(q1 - 1)**2/2 + p2**2/(2*q1**2) - g*q1*cos(q2)"
-        y0 = [r, ANGLE, speed, 0.0]
+        H, y0 = "p1**2/2 + k*(q1 - 1)**2/2 + p2**2/(2*q1**2) - g*q1*cos(q2)", [r, ANGLE, speed, 0.0]
         low, high = [max(1 - stretch, 0.1), -1.4, -fast, -1.5], [1 + stretch, 1.4, fast, 1.5]
     else:
         H = "(p1**2 + p2**2)/2 + k*(sqrt(q1**2 + q2**2) - 1)**2/2 + g*q2"
@@ -344,6 +343,5 @@ def magnetic_moment(system: HamiltonianSystem, y: Array) -> Array:
     B, q1, q2, q3, v3 = system.params["B"], y[..., 0], y[..., 1], y[..., 2], y[..., 5]
     axial = B * (1 + q3**2)
     v1, v2 = y[..., 3] + axial * q2 / 2, y[..., 4] - axial * q1 / 2
-    strength2 = axial**2 + (B * q3) ** 2 * (q1**2 + q2**2)
-    along = axial * v3 - B * q3 * (q1 * v1 + q2 * v2)
+    strength2, along = axial**2 + (B * q3) ** 2 * (q1**2 + q2**2), axial * v3 - B * q3 * (q1 * v1 + q2 * v2)
     return (v1**2 + v2**2 + v3**2 - along**2 / strength2) / (2 * strength2**0.5)

@@ -329,8 +329,7 @@ def fput_beta(n: int = 64, beta: float = 1.0, amplitude: float = 0.1) -> Hamilto
         raise ValueError(f"`n` must be even, for neighbours on the ring move against each other; got {n}.")
     b, A = _positive("beta", beta), _positive("amplitude", amplitude)
     w = math.sqrt(4 + 16 * b * A * A)
-    period = 4 * float(ellipk(8 * b * A * A / w**2)) / w
-    high = np.repeat([2 * A, 2 * A * w], n)
+    period, high = 4 * float(ellipk(8 * b * A * A / w**2)) / w, np.repeat([2 * A, 2 * A * w], n)
     wave = partial(_shortest, amplitude=A, frequency=w, modulus=8 * b * A * A / w**2, n=n)
     lattice: dict[str, Any] = {"bond": "r**2/2 + beta*r**4/4", "params": {"beta": b}}
     return _system("fput_beta", wave, _grid(n, 1.0), **lattice, high=high, t_end=20 * period, dt=period / 40)
@@ -344,9 +343,6 @@ def _shortest(
     sn, cn, dn, _ = ellipj(frequency * t, modulus)
     sign = (-1.0) ** np.arange(n)
     return sign * amplitude * cn, -sign * amplitude * frequency * sn * dn
-
-
-# the parts of a scene ----------------------------------------------------------------------------------------------
 
 
 def _system(

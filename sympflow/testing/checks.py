@@ -107,12 +107,9 @@ def check_integrator(factory: Factory, system: HamiltonianSystem | None = None) 
     if not (system is None or isinstance(system, HamiltonianSystem)):
         raise TypeError(f"`system` must be a HamiltonianSystem; got {type(system).__name__}.")
     if system is not None:
-        system.check_conservative(
-            "and most laws are those of conservative ones", "leave `system` out: one check has friction of its own"
-        )
-        system.check_autonomous(
-            "and most laws are those of autonomous ones", "leave `system` out: one check has a drive of its own"
-        )
+        why, remedy = "and most laws are those of {} ones", "leave `system` out: one check has {} of its own"
+        system.check_conservative(why.format("conservative"), remedy.format("friction"))
+        system.check_autonomous(why.format("autonomous"), remedy.format("a drive"))
     integrator.check(default_system() if system is None else system)
     passed, skipped = [], {}
     for check in CHECKS:

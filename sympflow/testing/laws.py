@@ -107,8 +107,7 @@ def a_step_length_for_each_state(integrator: Integrator, system: HamiltonianSyst
 
 def what_is_not_finite_stays_so(integrator: Integrator, system: HamiltonianSystem) -> None:
     """A step from NaN is not finite, so that a blow-up is seen; other states of the batch do not notice."""
-    step = _step(integrator, system)
-    y, h = states(system, 3), np.full(3, 0.05)
+    step, y, h = _step(integrator, system), states(system, 3), np.full(3, 0.05)
     alone = step(y, h)
     for bad in (np.nan, np.inf):
         spoilt = y.copy()
@@ -417,9 +416,6 @@ OF_RUNS: tuple[Callable[[Integrator, HamiltonianSystem], None], ...] = (
 )
 
 
-# ruff: noqa: PT018
-
-
 OMEGA, SHIFT = 5.3, 0.9  # of g(t) = sin(OMEGA t − SHIFT), whose zeros are known
 
 
@@ -475,8 +471,7 @@ def states_within_a_step_belong_to_it(integrator: Integrator, system: Hamiltonia
         return
     reference = solve(system, "dop853", (0.0, T_END), start(system), dense_output=True, rtol=1e-12, atol=1e-14).sol
     assert reference is not None
-    error = np.abs(inside - reference(times[within]).T).max()
-    allowed = np.abs(sol.y - reference(sol.t)).max()
+    error, allowed = np.abs(inside - reference(times[within]).T).max(), np.abs(sol.y - reference(sol.t)).max()
     assert error <= 20 * allowed + 1e-3 * np.abs(sol.y).max(), f"within steps it is wrong by {error:.1e}"
 
 
@@ -560,8 +555,7 @@ def the_start_time_does_not_matter(integrator: Integrator, system: HamiltonianSy
 
 def every_event_is_found(integrator: Integrator, system: HamiltonianSystem) -> None:
     """All zeros in both directions of time, by their direction, up to the count that ends the run; zeros in y too."""
-    phase = (np.arange(-20, 21) * np.pi + SHIFT) / OMEGA
-    ends = [T_END]
+    phase, ends = (np.arange(-20, 21) * np.pi + SHIFT) / OMEGA, [T_END]
     if _goes_backward(integrator, system):
         ends.append(-T_END)
     for t_end in ends:
@@ -570,8 +564,7 @@ def every_event_is_found(integrator: Integrator, system: HamiltonianSystem) -> N
         for direction, expected in ((0, zeros), (1, zeros[rises]), (-1, zeros[~rises])):
             sol = run(integrator, system, (0.0, t_end), events=_wave(direction), event_step=0.1, dense_output=True)
             assert sol.t_events is not None and sol.y_events is not None and sol.sol, "there are no events"
-            found = sol.t_events[0]
-            what = f"of direction {direction} towards t = {t_end}"
+            found, what = sol.t_events[0], f"of direction {direction} towards t = {t_end}"
             assert len(found) == len(expected), f"{len(found)} events {what} are found, there are {len(expected)}"
             assert_close(found, expected, 1e3 * EPS, f"the events {what} are misplaced")
             assert_close(sol.y_events[0], sol.sol(found).T, 1e3 * EPS, "the states of events differ from sol(t)")
@@ -631,12 +624,10 @@ def save_every_thins_the_outputs(integrator: Integrator, system: HamiltonianSyst
 
 def a_batch_reports_its_failures(integrator: Integrator, system: HamiltonianSystem) -> None:
     """The run of a batch, some of which blow up, has status −1 for these and 0 for the others."""
-    bad = 1e150 * np.ones(2 * system.ndof)
-    y0, times = np.stack([start(system), bad]), np.array([0.0, 8.0])
+    y0, times = np.stack([start(system), 1e150 * np.ones(2 * system.ndof)]), np.array([0.0, 8.0])
     with np.errstate(all="ignore"):
         outcome = integrator.run(Problem(system, 0.0, 8.0, y0, t_eval=times))
-    finite = np.isfinite(np.asarray(outcome.y)).all(axis=(0, 2))
-    status = np.broadcast_to(outcome.status, (2,))
+    finite, status = np.isfinite(np.asarray(outcome.y)).all(axis=(0, 2)), np.broadcast_to(outcome.status, (2,))
     for i, name in ((0, "an ordinary state"), (1, "a state that may blow up")):
         wanted = 0 if finite[i] else -1
         assert status[i] == wanted, f"run() gives {name} of a batch status {status[i]}; its outputs call for {wanted}"

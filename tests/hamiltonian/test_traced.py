@@ -410,6 +410,7 @@ SUMS = {
                      "sqrt(1 + p1**2 + p2**2) + cos(q1) + q2**2"),
     "shifted": (lambda q, p: ((p - 0.3) ** 2).sum(-1) / 2 - (q**2).sum(-1) / 2,
                 "((p1 - 0.3)**2 + (p2 - 0.3)**2)/2 - (q1**2 + q2**2)/2"),
+    "infinite at rest": (lambda q, p: (p * np.log(p) + q**2).sum(-1), "p1*log(p1) + p2*log(p2) + q1**2 + q2**2"),
     "driven": (lambda t, q, p: (p**2).sum(-1) / 2 + np.sin(t) * q[..., 0] + (q**2).sum(-1),
                "(p1**2 + p2**2)/2 + sin(t)*q1 + q1**2 + q2**2"),
 }  # fmt: skip

@@ -599,6 +599,11 @@ def test_a_star_may_have_bodies_without_mass_alone(method):
     np.testing.assert_allclose(y[6:9, 1], system.y0[6:9], atol=1e-12)
 
 
+def test_elements_have_names():
+    found = sympflow.elements(GIANTS.y0, GIANTS)
+    assert found["a"] is found.a is found[0]
+
+
 @pytest.mark.parametrize("dt", [5.0, 8.0])
 def test_usual_steps_of_the_solar_system_are_no_reason_to_warn(dt):
     """Kicks eleven times in a period of Mercury: in ten years it stays within 1e-5 of its place."""

@@ -54,8 +54,7 @@ class TestEveryKind:
     def test_t_eval_and_dense_output(self, method):
         times = np.array([0.0, 0.3, 1.0, 2.345, 5.0])
         theirs = solve_ivp(HH, (0, 5), HH.y0, method=solver(method), t_eval=times, dense_output=True)
-        ours = same(method, (0, 5), t_eval=times)
-        np.testing.assert_allclose(theirs.y, ours.y, atol=200 * EPS)
+        np.testing.assert_allclose(theirs.y, same(method, (0, 5), t_eval=times).y, atol=200 * EPS)
         np.testing.assert_allclose(theirs.sol(times), theirs.y, atol=200 * EPS)
         every = solve_ivp(HH, (0, 5.5), HH.y0, method=solver(method), dense_output=True)
         np.testing.assert_allclose(every.sol(every.t), every.y, atol=200 * EPS)
@@ -208,8 +207,7 @@ class TestAnotherSystem:
         Verlet = as_scipy("verlet", PENDULUM, dt=0.1)
         counts = []
         for t_end in (1.0, 1.0, 2.0, 1.5):
-            before = len(calls)
-            sol = solve_ivp(fun, (0, t_end), [0.0, 1.0], method=Verlet)
+            before, sol = len(calls), solve_ivp(fun, (0, t_end), [0.0, 1.0], method=Verlet)
             counts.append(len(calls) - before)
             assert sol.nfev > counts[-1]
         first, again, longer, within = counts
@@ -245,8 +243,7 @@ class TestAnotherSystem:
 
 
 def test_a_flow_and_a_name_without_system():
-    flow = get("sympflow")().flow_for(HH)
-    by_flow = solve_ivp(HH, (0, 5), HH.y0, method=as_scipy(flow))
+    by_flow = solve_ivp(HH, (0, 5), HH.y0, method=as_scipy(get("sympflow")().flow_for(HH)))
     np.testing.assert_array_equal(by_flow.y, solve_ivp(HH, (0, 5), HH.y0, method=as_scipy("sympflow")).y)
     by_name = solve_ivp(HH, (0, 1), HH.y0, method=as_scipy("verlet", dt=0.1))
     np.testing.assert_allclose(by_name.y, same("verlet", (0, 1)).y, atol=8 * EPS)

@@ -44,19 +44,13 @@ def small(kind="masses", **more):
 @pytest.mark.parametrize(
     ("kind", "compensated", "level", "friction"),
     [
-        ("masses", False, 0, None),
-        ("coupled", True, 0, None),
-        ("coupled", False, 0, 0),
-        ("coupled", False, FORCE_GRADIENT, None),
-        ("masses", True, FORCE_GRADIENT, None),
+        ("masses", False, 0, None), ("coupled", True, 0, None), ("coupled", False, 0, 0),
+        ("coupled", False, FORCE_GRADIENT, None), ("masses", True, FORCE_GRADIENT, None),
         ("masses", False, FORCE_GRADIENT, 1),
-        ("masses", True, CURVATURE, None),
-        ("coupled", False, CURVATURE, 0),
-        ("masses", False, POLYNOMIAL, 0),
-        ("coupled", True, POLYNOMIAL, None),
-        ("coupled", False, POLYNOMIAL, 1),
+        ("masses", True, CURVATURE, None), ("coupled", False, CURVATURE, 0), ("masses", False, POLYNOMIAL, 0),
+        ("coupled", True, POLYNOMIAL, None), ("coupled", False, POLYNOMIAL, 1),
     ],
-)
+)  # fmt: skip
 def test_loops_over_terms_are_the_stages_that_are_written_out(kind, compensated, level, friction):
     system = small(kind)
     monomials = ((4, 0, 0), (1, 2, 1)) if level == POLYNOMIAL else ()
@@ -118,13 +112,8 @@ def test_code_does_not_depend_on_how_many_terms_there_are(monkeypatch):
 def test_terms_that_differ_in_coordinates_and_constants_are_one_family():
     symbols = SYSTEM.symbols
     springs, *others = terms.families(symbols.V, symbols.q)
-    assert sorted(len(family.coordinates) for family in (springs, *others)) == [
-        1,
-        2,
-        2,
-        SITES - 1,
-        SITES - 1,
-    ]  # cosine; squares and cubes
+    sizes = sorted(len(family.coordinates) for family in (springs, *others))
+    assert sizes == [1, 2, 2, SITES - 1, SITES - 1]  # cosine; squares and cubes
     (masses,) = terms.families(symbols.T, symbols.p)
     assert masses.coordinates.shape == (SITES, 1)
 

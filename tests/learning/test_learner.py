@@ -55,8 +55,7 @@ def problem(model, data, sigma, **options):
 
 @pytest.mark.parametrize(("rate", "missing"), [(0.0, 0.0), (RATE, 0.0), (0.0, 0.1)], ids=["H", "friction", "gaps"])
 def test_shooting_finds_h_and_friction_to_rounding_where_numbers_are_missing_too(rate, missing):
-    runs = trajectories(8, 15, rate)
-    rng = np.random.default_rng(1)
+    runs, rng = trajectories(8, 15, rate), np.random.default_rng(1)
     for _, y in runs:
         y[rng.random(y.shape) < missing] = np.nan
     data = Trajectories.read(runs)
@@ -86,8 +85,7 @@ def test_derivatives_are_those_of_the_orbits(force, driven):
     if driven:
         model = replace(model, parts=(*model.parts, Drive(Polynomial.up_to(2, "q", [1.0]), 1.3)))
     theta, problem_ = problem(model, data, data.scales)
-    theta = theta + 0.05
-    batch, states = problem_.batches[0], first_states(data)
+    theta, batch, states = theta + 0.05, problem_.batches[0], first_states(data)
     *_, (_, _, X) = problem_._orbits(batch, theta, states, True)
 
     def end(theta, states):
@@ -249,8 +247,7 @@ def test_central_fields_are_found(force, V, observed):
     constraints = _constraints(data, None, None, False, None, None)
     candidates = [*FAMILIES["central"].models(constraints)][: 1 if observed == "qp" and force is KEPLER[0] else None]
     found = [fitted(candidate.model, data, Setting()) for candidate in candidates]
-    best = min(found, key=lambda one: one.loss(np.full(4, 1e-3)))
-    y = np.concatenate(orbits, axis=1)
+    best, y = min(found, key=lambda one: one.loss(np.full(4, 1e-3))), np.concatenate(orbits, axis=1)
     H = (y[2:] ** 2).sum(0) / 2 + V(np.hypot(*y[:2]))
     learned = best.model.hamiltonian(best.theta, y)
     assert np.ptp(learned - H) < 0.01 * np.ptp(H)
@@ -288,8 +285,7 @@ def test_learn_tells_what_it_did(noisy):
 
 def test_a_learned_flow_brings_its_system(noisy, tmp_path):
     noisy.save(tmp_path / "flow.safetensors")
-    flow = sympflow.load(tmp_path / "flow.safetensors")
-    y = np.array([0.2, 0.3])
+    flow, y = sympflow.load(tmp_path / "flow.safetensors"), np.array([0.2, 0.3])
     assert flow.system.hamiltonian(y) == pytest.approx(noisy.system.hamiltonian(y), rel=1e-12)
     assert flow.figures == noisy.figures
 
@@ -491,8 +487,7 @@ def test_drives_and_drag_are_learned(forced, tmp_path):
 def test_energies_scatter_along_many_short_trajectories_too():
     """Noise σ of q and p makes the energies of a circle of radius 1 scatter by σ, of 20 points by 4 % less."""
     t, rng = np.linspace(0, 5, 20), np.random.default_rng(0)
-    y = np.stack([np.cos(t), -np.sin(t)]) + 1e-3 * rng.normal(size=(500, 2, 20))
-    data = Trajectories.read((t, y))
+    data = Trajectories.read((t, np.stack([np.cos(t), -np.sin(t)]) + 1e-3 * rng.normal(size=(500, 2, 20))))
     search = Search(data, [data.split(0.9, 0)], _constraints(data, None, None, False, None, None), Setting(), 0)
     flow = sympflow.shipped_flows(sympflow.systems.harmonic_oscillator(), kind="sympflow")[0].load()
     assert search.energy_scatter(flow) == pytest.approx(0.96e-3, rel=0.15)
@@ -570,8 +565,7 @@ def test_a_flow_of_data_that_do_not_tell_h_is_of_these_data():
 def test_chaotic_trajectories_are_followed_in_pieces():
     """Hénon–Heiles at an energy of 0.16, over ten times 1/λ: errors grow by e^10, but not in pieces."""
     system = sympflow.systems.henon_heiles()
-    y0 = np.array([[0.0, 0.1, 0.549, 0.0], [0.0, -0.1, 0.52, 0.15]])
-    t = np.linspace(0, 100, 251)
+    y0, t = np.array([[0.0, 0.1, 0.549, 0.0], [0.0, -0.1, 0.52, 0.15]]), np.linspace(0, 100, 251)
     y = sympflow.solve(system, "kahan_li8", (0, 100), y0, t_eval=t, dt=0.05).y
     data = Trajectories.read((t, y + 5e-3 * np.random.default_rng(0).normal(size=y.shape)))
     model = Model(2, (known_kinetic(np.eye(2)), Polynomial("q", [[2, 0], [0, 2], [2, 1], [0, 3]], [1.0, 1.0])))
@@ -639,8 +633,7 @@ def test_networks_grow_no_steps():
     q = np.linspace(-1, 1, 41)
     runs = [(np.linspace(0, 1, 41), np.stack([q, np.sign(q + shift)])) for shift in (0.0, 0.01)]
     data = Trajectories.read(runs)
-    network = Network("q", 3, data.scales[:1])
-    model = Model(1, (known_kinetic(np.eye(1)), network))
+    model = Model(1, (known_kinetic(np.eye(1)), Network("q", 3, data.scales[:1])))
     theta = matched(model, model.start(np.random.default_rng(0)), data, 1 / data.scales, 60)
     a = np.abs(theta[3:])
     assert a.max() < 40

@@ -42,13 +42,11 @@ def test_missing_values_stay_missing_and_empty_points_go():
     read = Trajectories.read((t, y))
     assert_same(read, [(t[[0, 1, 2, 4, 5]], y[:, [0, 1, 2, 4, 5]])])
     assert (read.n_values, read.n_points, len(read.states)) == (9, 5, 4)
-    masked = Trajectories.read((t, np.ma.masked_invalid(y)))
-    np.testing.assert_array_equal(masked.runs[0].y, read.runs[0].y)
+    np.testing.assert_array_equal(Trajectories.read((t, np.ma.masked_invalid(y))).runs[0].y, read.runs[0].y)
 
 
 def test_results_of_solvers_are_read():
-    system = pendulum()
-    states = np.array([[1.0, 0.0], [0.5, 0.2]])
+    system, states = pendulum(), np.array([[1.0, 0.0], [0.5, 0.2]])
     sol = sympflow.solve(system, "verlet", (0, 1), states, t_eval=t)
     assert_same(Trajectories.read(sol), [(t, sol.y[0]), (t, sol.y[1])])
     assert_same(Trajectories.read([sol, sol]), [(t, y) for y in (*sol.y, *sol.y)])
@@ -307,8 +305,7 @@ def test_bad_data_are_refused_with_the_remedy(data, options, message):
 
 
 def test_the_order_is_that_of_columns_with_names_of_their_own_and_of_trajectories_read_before():
-    pandas = pytest.importorskip("pandas")
-    table = pandas.DataFrame({"t": t, **dict(zip("abcd", FOUR, strict=True))})
+    table = pytest.importorskip("pandas").DataFrame({"t": t, **dict(zip("abcd", FOUR, strict=True))})
     read = Trajectories.read(table, 2, order="pairs")
     assert read.names == ("a", "c", "b", "d")
     assert np.array_equal(read.runs[0].y, FOUR[[0, 2, 1, 3]])

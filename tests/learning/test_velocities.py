@@ -36,8 +36,7 @@ def observations(system, observed, runs=5, noise=0.0):
 def accelerations(model, theta, y):
     """q'' of a model at observations (2d, N)."""
     x = model.states(theta, y)
-    field = model.field(theta, x, False, False).value
-    velocities = replace(model, velocities=True)
+    field, velocities = model.field(theta, x, False, False).value, replace(model, velocities=True)
     return velocities.observed(theta, x, field[:, None])[1][model.ndof :, 0]
 
 
@@ -89,10 +88,8 @@ def test_angles_that_nobody_told_of_are_tried(period, spread, names):
 def test_what_is_observed_of_a_state_has_the_derivatives_that_are_said(inertial, force):
     data, _ = observations(double_pendulum() if inertial else CARTS, "qv")
     model = candidate("inertia" if inertial else "polynomial", data, 1, 2 * np.pi if inertial else None)
-    model = replace(model, force=force)
-    rng, h = np.random.default_rng(0), 1e-6
-    theta = rng.uniform(0.1, 0.2, model.n)
-    y = data.runs[0].y[:, ::20]
+    model, rng, h = replace(model, force=force), np.random.default_rng(0), 1e-6
+    theta, y = rng.uniform(0.1, 0.2, model.n), data.runs[0].y[:, ::20]
     x = model.states(theta, y)
     assert model.observed(theta, x, None)[0] == pytest.approx(y, abs=1e-12)
     X = np.concatenate([np.eye(4), np.zeros((4, model.n))], axis=1)[..., None] * np.ones(x.shape[1])
@@ -121,8 +118,7 @@ def test_motions_are_found_by_shooting(system, family, place, period, observed):
     data, y = observations(system, observed)
     model = candidate(family, data, place, period)
     found = fitted(model, data, Setting(np.full(2 * system.ndof, 1e-5)))  # as far as they are to be followed
-    v = system.vector_field(y[0].T).T[: system.ndof]
-    seen = np.concatenate([y[0, : system.ndof], v])
+    seen = np.concatenate([y[0, : system.ndof], system.vector_field(y[0].T).T[: system.ndof]])
     right = np.einsum("nij,nj->in", system.field_jacobian(y[0].T), system.vector_field(y[0].T))[: system.ndof]
     assert accelerations(model, found.theta, seen) == pytest.approx(right, abs=1e-3)
 
@@ -148,8 +144,7 @@ def test_the_noise_of_velocities_biases_nothing():
 def test_learn_gives_h_and_the_momenta():
     spring = sympflow.HamiltonianSystem.from_sympy("p**2 + q**2", name="spring")
     data, y = observations(spring, "qv", noise=0.005)
-    flow = sympflow.learn(data, family="polynomial", dt=0.5)
-    v = 2 * y[:, 1, 0]
+    flow, v = sympflow.learn(data, family="polynomial", dt=0.5), 2 * y[:, 1, 0]
     p = flow.system.momenta(y[:, :1, 0], v[:, None])
     assert p[:, 0] == pytest.approx(v, abs=1e-12)
     made = sympflow.solve(flow.system, flow, (0, 2), np.stack([y[:, 0, 0], p[:, 0]], 1), t_eval=t).y
@@ -166,8 +161,7 @@ def test_learn_gives_h_and_the_momenta():
 )  # fmt: skip
 def test_momenta_are_those_of_velocities(system, v):
     q = 0.3 * np.ones((1, system.ndof))
-    p = system.momenta(q, np.array(v))
-    found = system.vector_field(np.concatenate([q, p], axis=1))[:, : system.ndof]
+    found = system.vector_field(np.concatenate([q, system.momenta(q, np.array(v))], axis=1))[:, : system.ndof]
     assert found == pytest.approx(np.array(v), abs=1e-12)
 
 
@@ -198,6 +192,5 @@ def test_only_the_factor_of_h_is_given():
 
 def test_the_first_velocity_is_the_slope_of_the_positions():
     data, y = observations(PENDULUM, "q")
-    model = Model(1, (known_kinetic(np.eye(1)),), velocities=True)
-    starts = first_states(data, model, np.zeros(0))
+    starts = first_states(data, Model(1, (known_kinetic(np.eye(1)),), velocities=True), np.zeros(0))
     assert starts[:, 1] == pytest.approx(2 * y[:, 1, 0], abs=0.02)  # of a cubic over 0.36

@@ -44,8 +44,7 @@ def test_the_trace_is_exact():
 def test_the_polynomial_is_that_of_the_executed_step(name):
     """½ tr of the Jacobian of a step, at steps in each interval and window; and cos z up to the order."""
     oscillator, method = systems.harmonic_oscillator(3.0), get(name)()
-    p = np.array([float(c) for c in half_trace(SCHEMES[name])])
-    z = np.array([0.3, 1.0, 2.2, 3.14])
+    p, z = np.array([float(c) for c in half_trace(SCHEMES[name])]), np.array([0.3, 1.0, 2.2, 3.14])
     _, A = method.tangent(oscillator, 0.0, np.zeros((4, 2)), z / 3.0)
     np.testing.assert_allclose(np.trace(A, axis1=1, axis2=2) / 2, np.polyval(p[::-1], z**2), rtol=1e-11, atol=1e-12)
     order = SCHEMES[name].order
@@ -55,11 +54,9 @@ def test_the_polynomial_is_that_of_the_executed_step(name):
 
 @pytest.mark.parametrize("name", SCHEMES)
 def test_the_spectral_radius_exceeds_one_in_the_windows_alone(name):
-    found = linear_stability(name)
-    p = np.array([float(c) for c in half_trace(SCHEMES[name])])[::-1]
+    found, p = linear_stability(name), np.array([float(c) for c in half_trace(SCHEMES[name])])[::-1]
     for z in np.linspace(0.01, 7.0, 500):
-        window = found.window_of(z)
-        c = abs(np.polyval(p, z**2))
+        window, c = found.window_of(z), abs(np.polyval(p, z**2))
         assert (c > 1) == (window is not None) or abs(c - 1) < 1e-6
         if window is not None:
             assert c + math.sqrt(max(0.0, c * c - 1)) <= window.growth * (1 + 1e-9)
@@ -154,7 +151,6 @@ def test_a_resonance_of_the_impulse_method_is_a_window():
     system = HamiltonianSystem.from_sympy("p**2/2 + 25*q**2/2 - 1 + cos(q)", y0=[0.1, 0.0])
     found = of_method(get("impulse")(), system, _small(system), 1.0)
     h = np.linspace(0.4, 0.9, 100_001)
-    c = np.cos(5 * h) + h / 10 * np.sin(5 * h)
-    outside = h[np.abs(c) > 1]
+    outside = h[np.abs(np.cos(5 * h) + h / 10 * np.sin(5 * h)) > 1]
     assert found.windows[0].start == pytest.approx(outside[0], abs=2e-4)
     assert found.windows[0].stop == pytest.approx(outside[-1], abs=2e-4)

@@ -9,8 +9,7 @@ from sympflow.metrics.reference import reference
 
 def test_reference_of_a_quadratic_hamiltonian_is_exact():
     omega, t = 100.0, np.linspace(0, 10, 101)
-    system = systems.harmonic_oscillator(omega)
-    exact = reference(system, (0, 10), np.array([[1.0, 0.0], [0.0, omega]]), t)
+    exact = reference(systems.harmonic_oscillator(omega), (0, 10), np.array([[1.0, 0.0], [0.0, omega]]), t)
     assert exact.method == "exact (linear flow)"
     c, s = np.cos(omega * t), np.sin(omega * t)
     truth = np.array([[c, -omega * s], [s, omega * c]])
@@ -19,8 +18,7 @@ def test_reference_of_a_quadratic_hamiltonian_is_exact():
 
 def test_reference_of_coupled_oscillators_satisfies_the_equations():
     system = HamiltonianSystem.from_sympy("p1**2/2 + p2**2/4 + p1*p2/5 + q1**2 + 3*q2**2 + q1*q2")
-    t = np.linspace(0, 3, 61)
-    y0 = np.array([1.0, -0.5, 0.2, 0.7])
+    t, y0 = np.linspace(0, 3, 61), np.array([1.0, -0.5, 0.2, 0.7])
     exact = reference(system, (0, 3), y0, t)
     assert exact.method.startswith("exact")
     sol = solve(system, "dop853", (0, 3), y0, t_eval=t, rtol=1e-13, atol=1e-14)
@@ -48,8 +46,7 @@ def test_reference_says_how_it_was_made_and_how_accurate_it_is(system, method):
 def test_error_of_verlet_quarters_when_the_step_halves():
     system, t = systems.henon_heiles(), np.linspace(0, 10, 11)
     coarse, fine = (solve(system, "verlet", (0, 10), t_eval=t, dt=dt) for dt in (0.02, 0.01))
-    ratio = reference_error(coarse)[1:] / reference_error(fine)[1:]
-    np.testing.assert_allclose(ratio, 4, rtol=0.02)
+    np.testing.assert_allclose(reference_error(coarse)[1:] / reference_error(fine)[1:], 4, rtol=0.02)
 
 
 def test_reference_may_be_given_and_must_fit():

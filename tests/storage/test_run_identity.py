@@ -200,8 +200,7 @@ def test_a_digest_is_that_of_another_process_and_changes_with_a_module_of_the_us
 
 
 def test_what_cannot_be_told_from_another_is_said(tmp_path):
-    lock = threading.Lock()
-    known = Known()
+    lock, known = threading.Lock(), Known()
     known.add("reduce", "f", lambda t, y: lock)
     assert known.untold == {"reduce": "an object of _thread.lock"}
     assert known.python == {"reduce"}

@@ -103,8 +103,7 @@ def test_a_flow_in_eager_torch_beside_compiled_methods_says_so():
 
 
 def test_a_reference_of_another_problem_is_refused():
-    system = systems.pendulum()
-    few = {"metrics": ["error"], "t_span": (0, 10), **QUICK}
+    system, few = systems.pendulum(), {"metrics": ["error"], "t_span": (0, 10), **QUICK}
     t = np.linspace(0.2, 10, 50)
     other = HamiltonianSystem.from_sympy("p**2/2 + q**2/2 - 1", y0=system.y0)
     with pytest.raises(ValueError, match=r"^`reference` is a solution of another system, 'custom': pass one of 'pen"):
@@ -179,8 +178,7 @@ def test_files_hold_every_figure(report, tmp_path):
 
 def test_json_is_strict_where_a_run_blew_up(tmp_path):
     report = compare(systems.harmonic_oscillator(), [get("verlet")(dt=2.1)], ["energy"], t_span=(0, 5000), **QUICK)
-    text = report.to_json(tmp_path / "rows.json").read_text()
-    content = json.loads(text, parse_constant=pytest.fail)
+    content = json.loads(report.to_json(tmp_path / "rows.json").read_text(), parse_constant=pytest.fail)
     assert content["rows"][0]["energy_error"] == "inf"
 
 

@@ -39,8 +39,7 @@ def test_plot_returns_the_figure_and_saves_it_where_a_path_says(report, tmp_path
 
 
 def test_energy_panel_shows_the_running_maximum(report):
-    ax = report.figure("energy").axes[0]
-    bold = [line for line in ax.lines if line.get_linewidth() > 1]
+    bold = [line for line in report.figure("energy").axes[0].lines if line.get_linewidth() > 1]
     assert bold[0].get_ydata()[-1] == report.rows[0].energy_error
     assert (np.diff(bold[0].get_ydata()) >= 0).all()
 
@@ -122,8 +121,7 @@ else:
 
 @pytest.mark.slow
 def test_the_portrait_of_a_flow_in_another_time_is_that_of_its_physical_time():
-    system = systems.kepler(0.6)
-    flow = get("sympflow")(flow="kepler-log-1")
+    system, flow = systems.kepler(0.6), get("sympflow")(flow="kepler-log-1")
     report = compare(system, [flow], ["energy"], t_span=(0, 50), n_outputs=40, repeats=1)
     points = report.figure("portrait").axes[0].lines[1].get_xydata()
     section = poincare_section(system, flow, (0, 50))

@@ -38,8 +38,7 @@ def test_the_limit_of_an_oscillator_is_two_at_every_frequency(method, omega):
 )
 def test_the_first_loss_of_stability_is_found_whatever_the_steps(method, first):
     """At ω = 3 the energy is lost from 1.047 on with omelyan4; a sweep that doubles its steps calls 1.788 stable."""
-    system = systems.harmonic_oscillator(3.0)
-    few = {"metrics": ("energy",), "max_steps": 5000}
+    system, few = systems.harmonic_oscillator(3.0), {"metrics": ("energy",), "max_steps": 5000}
     found = [stability(system, [method], steps=steps, **few).limits[0] for steps in ([0.1], [0.3, 1.6], [4.0, 5.0])]
     assert found[0] == found[1] == found[2]
     assert 3 * found[0].stable == pytest.approx(first, abs=6e-5)
@@ -129,8 +128,7 @@ def test_an_overflow_is_never_a_small_error():
     ],
 )
 def test_a_singularity_is_found_within_a_step(method, dt):
-    system = systems.henon_heiles_escape()
-    sol = solve(system, method, (0.0, 10.0), dt=dt)
+    sol = solve(systems.henon_heiles_escape(), method, (0.0, 10.0), dt=dt)
     assert sol.status == -1
     end = blow_up(sol)
     assert end.singular
@@ -144,8 +142,7 @@ def test_a_singularity_is_found_within_a_step(method, dt):
 )
 def test_a_singularity_is_found_whatever_the_step_or_the_tolerance(method, options):
     system = systems.henon_heiles_escape()
-    sol = solve(system, method, (0.0, 20.0), on_domain_exit="ignore", **options)
-    end = blow_up(sol)
+    end = blow_up(solve(system, method, (0.0, 20.0), on_domain_exit="ignore", **options))
     assert end.singular
     assert abs(end.time - SINGULARITY) < 1e-8
     assert "grows" not in str(end)
@@ -233,8 +230,7 @@ def test_rows_of_a_singular_solution():
 
 def test_a_flow_outside_its_domain_is_not_called_stable():
     """The solution does not exist beyond t*; the flow goes on, finite and wrong, outside Ω."""
-    escaping = [[0.0, 0.0, 0.0, 0.7]]
-    arguments = {"steps": [0.1], "t_span": (0.0, 20.0), "y0": escaping, "min_steps": 1}
+    arguments = {"steps": [0.1], "t_span": (0.0, 20.0), "y0": [[0.0, 0.0, 0.0, 0.7]], "min_steps": 1}
     network = sympflow.get("sympflow")(flow="henon_heiles-sympflow")
     report = stability(systems.henon_heiles(), [network], metrics=("energy",), **arguments)
     (row,), (limit,) = report.rows, report.limits

@@ -95,8 +95,7 @@ def refuses_tensors(self, system, t, y, h):
 
 
 def heun(self, system, t, y, h):
-    h = np.asarray(per_state(h, y))
-    k = np.asarray(system(t, y))
+    h, k = np.asarray(per_state(h, y)), np.asarray(system(t, y))
     return (y + h / 2 * (k + np.asarray(system(t, y + h * k)))).astype(y.dtype)
 
 
@@ -302,8 +301,7 @@ def saves_every_step(self, problem):
 
 
 def friction_far_out(self, system, t, y, h):
-    y_next = SoundVerlet.step(self, system, t, y, h)
-    far = (y * y).sum(-1) > 0.5
+    y_next, far = SoundVerlet.step(self, system, t, y, h), (y * y).sum(-1) > 0.5
     return y_next * (1 - 1e-3 * (far.to(y.dtype) if torch.is_tensor(y) else np.asarray(far, y.dtype)))[..., None]
 
 
@@ -356,8 +354,7 @@ class Rk4(FixedStep):
         return system.vector_field(y, t + c * h)
 
     def step(self, system, t, y, h):
-        s = per_state(h, y)
-        k = self.slope(system, t, y, 0.0, h)
+        s, k = per_state(h, y), self.slope(system, t, y, 0.0, h)
         total = k
         for c, weight in ((0.5, 2), (0.5, 2), (1.0, 1)):
             k = self.slope(system, t, y + c * s * k, c, h)
