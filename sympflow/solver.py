@@ -37,7 +37,7 @@ from sympflow.arrays import (
     to_numpy,
 )
 from sympflow.integrators.base import run_and_search
-from sympflow.integrators.choosing import check_tolerance, choose_method, step_for, with_start, with_step
+from sympflow.integrators.choosing import check_tolerance, choose_method, state_error, step_for, with_start, with_step
 from sympflow.integrators.contract import Failure, Integrator, Interrupted, Outcome, Problem
 from sympflow.integrators.diagnosis import (
     check_domain,
@@ -68,6 +68,7 @@ if TYPE_CHECKING:
     from sympflow.hamiltonian.parameter_rows import ParameterRows
     from sympflow.storage.runs import RunStore
 
+COMPARED = 16  # outputs of a run with a chosen step, at most, at which it is compared with one of half the step
 FIRST_WINDOW = 4096  # steps of the first of the ever longer runs to an infinite end
 
 
@@ -119,8 +120,9 @@ def solve(
     tol : float, optional
         The largest relative energy error that is asked for; on the logarithmic clock, which may keep H where the time
         is wrong, the error of states. A method of fixed steps takes the step that `sympflow.choose_step` finds by short
-        trial runs; for "sympflow" it chooses the flow, see its option. The run itself is checked: where its energy
-        error is larger, a RuntimeWarning and the message say so.
+        trial runs; for "sympflow" it chooses the flow, see its option. The error of the run itself is in `stats`,
+        "energy_error" or "state_error": where it is larger, a RuntimeWarning and the message say so. That of states,
+        or with friction or a drive, is found by another run with half of the step.
     tol_of : {"energy", "state"}
         See `sympflow.choose_step`.
     params : mapping of str to array_like, optional
@@ -274,7 +276,8 @@ def solve(
         )
     steps_chosen = tol is not None and "tol" not in integrator.options()
     if tol is not None and steps_chosen:
-        integrator = replace(integrator, dt=step_for(integrator, problem, tol, tol_of))  # type: ignore[type-var]
+        dt, tol_of = step_for(integrator, problem, tol, tol_of)
+        integrator = replace(integrator, dt=dt)  # type: ignore[type-var]
         if store is None and math.isfinite(t1):
             _check_outputs(integrator, problem, tol)
     elif system.step_is_open and readable(y_start):
@@ -282,8 +285,8 @@ def solve(
     sol = _shown(integrator, problem, action, rows, progress)
     if moving is not None:
         sol.y = moving.ended(system, sol.y, sol.t)
-    if tol is not None and steps_chosen and store is None and tol_of == "energy" and system.shows_energy:
-        _check_tolerance_met(sol, tol)
+    if tol is not None and steps_chosen and store is None and readable(y_start):
+        _check_tolerance_met(sol, integrator, problem, rows, tol, tol_of)
     if chosen is not None:
         sol.stats["chosen"] = f"{sol.integrator.label}: {chosen}"
         sol.message += f" Method {sol.integrator.label!r} was chosen: {chosen}."
@@ -331,15 +334,41 @@ def _check_outputs(integrator: Integrator, problem: Problem, tol: float) -> None
         ) from error
 
 
-def _check_tolerance_met(sol: Solution, tol: float) -> None:
-    """Note a run whose energy error is larger than was asked for."""
+def _check_tolerance_met(
+    sol: Solution, integrator: Integrator, problem: Problem, rows: ParameterRows | None, tol: float, tol_of: str
+) -> None:
+    """Measure the error of a run, and note one that is larger than was asked for."""
+    if not len(sol.t) or (tol_of == "energy" and sol.system.between_impulses is not sol.system):
+        return
     with warnings.catch_warnings(action="ignore"):  # of an error that is absolute
-        error = float(np.max(np.abs(energy_change(sol)), initial=0.0))
-    sol.stats["energy_error"] = error
-    if error > tol:
-        note = f"The relative energy error of the run is {error:.2g}, more than `tol` {tol:g}: pass a smaller one."
+        kept = tol_of == "energy" and sol.system.shows_energy
+        error = energy_change(sol) if kept else _change_by_halves(sol, integrator, problem, rows, tol_of)
+    largest = float(np.fmax.reduce(np.abs(error), axis=None, initial=0.0))
+    sol.stats[f"{tol_of}_error"] = largest
+    if largest > tol:
+        note = f"The relative {tol_of} error of the run is {largest:.2g}, more than `tol` {tol:g}: pass a smaller one."
         sol.message += f" {note}"
         warn(note, RuntimeWarning)
+
+
+def _change_by_halves(
+    sol: Solution, integrator: Integrator, problem: Problem, rows: ParameterRows | None, tol_of: str
+) -> np.ndarray:
+    """The differences of states, or of H, at some outputs from a run with half of the step."""
+    few = slice((len(sol.t) - 1) % (every := -(-len(sol.t) // COMPARED)), None, every)  # with the last
+    half: Any = replace(integrator, dt=0.5 * integrator.dt)  # type: ignore[attr-defined, type-var]
+    y0, times = problem.y0 if rows is not None else to_numpy(problem.y0), sol.t[few]
+    alike = replace(problem, y0=y0, t1=float(times[-1]), t_eval=times, save_every=1, dense_output=False, events=None)
+    try:
+        finer = _answered(half, replace(alike, diagnosed=False), "ignore", rows)
+    except Interrupted as stop:
+        raise Interrupted(stop.outcome, sol) from None
+    n = len(finer.t)
+    if tol_of == "energy":
+        H = to_numpy(sol.energy())[..., few][..., :n]
+        return (H - to_numpy(finer.energy())) / sol.energy_scale()[..., None]
+    change = to_numpy(sol.states)[..., few, :][..., :n, :] - to_numpy(finer.states)
+    return state_error(sol.system, to_numpy(y0), change)
 
 
 def _answered(integrator: Integrator, problem: Problem, action: str, rows: ParameterRows | None) -> Solution:

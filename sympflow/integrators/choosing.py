@@ -23,6 +23,7 @@ from sympflow.hamiltonian.scales import (
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep
 from sympflow.integrators.contract import Integrator, Problem
+from sympflow.integrators.impulses import landings, run_in_pieces
 from sympflow.integrators.registry import build, check_applies, get
 from sympflow.lazy import lately_kept
 from sympflow.systems.given import GivenSystem, given_system
@@ -170,7 +171,7 @@ def integrator_for(
         integrator = build(method, dict(options) if takes_tol else given)
     if tol is not None and "tol" not in integrator.options():
         problem = Problem(system, *t_span, y0)
-        return replace(integrator, dt=step_for(integrator, problem, tol))  # type: ignore[type-var]
+        return replace(integrator, dt=step_for(integrator, problem, tol)[0])  # type: ignore[type-var]
     return with_step(integrator, system, y0)
 
 
@@ -211,7 +212,7 @@ def choose_step(
         The largest error: |H − H₀| relative to the `energy_scale` of `sympflow.metrics.energy`. Where H is not
         conserved, with friction or a drive, the difference of H from that of a run with half of the step takes its
         place. Where H is kept whatever the step, as by Gauss methods on a quadratic H, and for the methods on the
-        logarithmic clock, the error is that of the states.
+        logarithmic clock, the error is that of the states; also of a driven H that jumps in t.
     y0 : array_like of shape (..., 2d), optional
         Initial states, by default the system's.
     t_span : (float, float), optional
@@ -243,7 +244,7 @@ def choose_step(
     if y.ndim == 0 or y.shape[-1] != 2 * system.ndof:
         raise ValueError(f"`y0` must have shape (..., {2 * system.ndof}), states [q, p]; got {y.shape}.")
     t0, t1 = check_t_span(system.t_span if t_span is None else t_span, False)
-    return step_for(integrator, Problem(system, t0, t1, y), tol, tol_of)
+    return step_for(integrator, Problem(system, t0, t1, y), tol, tol_of)[0]
 
 
 def check_tolerance(tol: Any, tol_of: Any) -> None:
@@ -254,8 +255,8 @@ def check_tolerance(tol: Any, tol_of: Any) -> None:
         raise ValueError(f"`tol_of` must be 'energy' or 'state'; got {tol_of!r}.")
 
 
-def step_for(integrator: Integrator, problem: Problem, tol: float, tol_of: str = "energy") -> float:
-    """The step of `choose_step` for a problem."""
+def step_for(integrator: Integrator, problem: Problem, tol: float, tol_of: str = "energy") -> tuple[float, str]:
+    """The step of `choose_step` for a problem, and what its error is of: the "energy" or the "state"."""
     check_tolerance(tol, tol_of)
     if not isinstance(integrator, FixedStep) or integrator.trained:
         own = "a flow has its own: leave `tol` out"
@@ -273,9 +274,12 @@ def step_for(integrator: Integrator, problem: Problem, tol: float, tol_of: str =
     length = abs(problem.t1 - problem.t0)
     step = float(with_step(integrator, system, states).step_length(system) or system.dt)
     trial = replace(problem, system=system, y0=states, events=None)
+    uneven = system.definition.may_jump and not system.keeps_energy  # no energy is compared across jumps
+    if uneven or system.keeps_energy is not system.shows_energy or integrator.in_another_time:
+        tol_of = "state"  # on a clock H is kept where time is wrong
     error = _error(integrator, trial, tol_of, TRIAL_LENGTH * step)
     check_applies(integrator, system, states)
-    most = min(length, integrator.longest_step(system))
+    most = min(length, integrator.longest_step(system), system.definition.shortest_piece)
     h = min(step, most)
     good, bad, least = 0.0, math.inf, math.inf
     kept = math.inf  # the shortest step with which H is kept to rounding
@@ -302,11 +306,12 @@ def step_for(integrator: Integrator, problem: Problem, tol: float, tol_of: str =
             break
         h = min(following, most)
     if not good:
+        limit = "near rounding" if least <= AT_ROUNDING else f"with steps down to {min(bad, h):.2g}"
         raise ValueError(
             f"`tol` {tol:g} is not met by method {integrator.label!r}: the smallest error of the trial runs is "
-            f"{least:.1e}, near rounding. Raise it, or pass `dt`."
+            f"{least:.1e}, {limit}. Raise it, or pass `dt`."
         )
-    return _rounded(good, length)
+    return _rounded(good, length), tol_of
 
 
 def _rounded(h: float, length: float) -> float:
@@ -321,14 +326,14 @@ def _error(integrator: FixedStep, problem: Problem, tol_of: str, trial: float) -
     """The error of a trial run over a time, as a function of the step."""
     system, y0 = problem.system, problem.y0
     sign, length = math.copysign(1.0, problem.t1 - problem.t0), abs(problem.t1 - problem.t0)
-    factors, smallest = weights(system), smallest_size(system, y0)
-    compiled, idle = False, system.keeps_energy is not system.shows_energy
-    of_states = tol_of == "state" or idle or integrator.in_another_time  # on a clock H is kept where time is wrong
+    compiled, of_states = False, tol_of == "state"
 
     def run(h: float, end: float, n: int) -> tuple[np.ndarray, np.ndarray]:
         t = problem.t0 + sign * np.linspace(0.0, end, n + 1)
         with np.errstate(all="ignore"):
-            outcome = replace(integrator, dt=h).run(replace(problem, t1=float(t[-1]), t_eval=t, diagnosed=False))
+            stepped, piece = replace(integrator, dt=h), replace(problem, t1=float(t[-1]), t_eval=t, diagnosed=False)
+            _, jumps = landings(stepped, system, piece.t0, piece.t1, kinks=True)
+            outcome = run_in_pieces(lambda *given: (given[0].run(given[1]), given[1]), stepped, piece, jumps)[0]
         nonlocal compiled
         compiled = outcome.stats.get("backend") == "compiled"
         full = np.full((n + 1, *y0.shape), np.nan)
@@ -351,10 +356,16 @@ def _error(integrator: FixedStep, problem: Problem, tol_of: str, trial: float) -
             else:
                 _, finer = run(h / 2, end, n)
                 if of_states:
-                    found = np.abs(factors * (y - finer)).max(-1) / (factors.max() * smallest)
+                    found = state_error(system, y0, y - finer)
                 else:
                     found = np.abs(H - np.asarray(system.hamiltonian(finer, times))) / scale
         worst = float(np.max(found))
         return worst if math.isfinite(worst) else math.inf
 
     return error
+
+
+def state_error(system: HamiltonianSystem, y0: np.ndarray, change: np.ndarray) -> np.ndarray:
+    """The size of differences (..., 2d) of states relative to that of the states y0, q and p in comparable units."""
+    factors = weights(system)
+    return np.abs(factors * change).max(-1) / (factors.max() * smallest_size(system, y0))

@@ -181,6 +181,43 @@ def test_a_missed_tolerance_is_told(monkeypatch):
     assert "more than `tol`" in sol.message
 
 
+LONG_RUNS = {
+    "states": (systems.henon_heiles(), "verlet", 5000, {"tol": 1e-4, "tol_of": "state"}),
+    "a quartic": (systems.quartic(), "rk4", 3000, {"tol": 1e-5, "tol_of": "state"}),
+    "a drive": (systems.driven_pendulum(), "rk4", 1000, {"tol": 1e-5}),
+    "friction": (text("p**2/2 + q**4/4", damping=1e-3, y0=[1, 0]), "rk4", 1000, {"tol": 1e-5}),
+}
+
+
+@pytest.mark.parametrize(("system", "method", "end", "asked"), LONG_RUNS.values(), ids=LONG_RUNS)
+def test_errors_that_grow_beyond_the_trial_runs_are_told(system, method, end, asked):
+    """As large as against an adaptive run of another family, up to the part that half of the step has too."""
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        sol = solve(system, method, (0, end), **asked)
+    exact = solve(system, "dop853", (0, end), t_eval=sol.t[::-1][:: len(sol.t) // 100][::-1], rtol=1e-12, atol=1e-13)
+    kept = np.searchsorted(sol.t, exact.t)
+    if "tol_of" in asked:
+        error = np.abs(sol.y[:, kept] - exact.y).max() / np.abs(system.y0).max()
+    else:
+        error = np.abs(sol.energy()[kept] - exact.energy()).max() / sol.energy_scale()
+    found = sol.stats[f"{asked.get('tol_of', 'energy')}_error"]
+    assert 0.4 < found / error < 1.5
+    assert [f"more than `tol` {asked['tol']:g}" in str(each.message) for each in told] == [True] * (
+        found > asked["tol"]
+    )
+
+
+@pytest.mark.parametrize("asked", [{"tol": 1e-4}, {"tol": 1e-7}, {"tol": 1e-4, "tol_of": "state"}])
+def test_trial_runs_end_steps_where_H_jumps(asked):
+    """The cell is of quadrupoles and drifts: its steps are as long as these, and no shorter by the jumps."""
+    sol = solve(systems.fodo_cell(), t_span=(0, 10), **asked)
+    assert sol.stats["dt"] >= 0.125
+    error = sympflow.reference_error(sol).max()
+    assert 1e-13 < error <= asked["tol"]
+    assert 0.5 < sol.stats["state_error"] / error < 2
+
+
 def test_a_start_is_looked_at_once():
     """Without a y0 in the system, steps and scales come from the states of the run, and are found once."""
     system, y0 = text(KEPLER), np.array([[1.0, 0.0, 0.0, 0.8], [1.0, 0.0, 0.0, 0.9]])
