@@ -141,7 +141,7 @@ def test_the_units_do_not_matter(e):
     assert not coupled.separable
     np.testing.assert_allclose(coupled.vector_field(y), exact + 0.3 * y * [1, -1], rtol=1e-12)
     moved = from_hamiltonian(lambda q, p: plain(q, p) + 0.3 * p.sum(-1), 1, y0=y0)
-    np.testing.assert_allclose(moved.vector_field(y), exact + [0.3, 0.0], rtol=1e-12)
+    np.testing.assert_allclose(moved.vector_field(y), exact + np.array([0.3, 0.0]), rtol=1e-12)
 
 
 @pytest.mark.parametrize("e", [1e-9, 1.0, 7e8])
