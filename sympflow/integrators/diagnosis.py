@@ -276,7 +276,9 @@ def _passage(poles: Poles, t: np.ndarray, y: np.ndarray, scale: float) -> Passag
 def _remedy(integrator: Integrator, problem: Problem) -> str:
     if integrator.step_length(problem.system) is None:
         return "Reduce `rtol` and `atol`, or soften H there"
-    own = "a clock of its own, such as 'log_leapfrog'" if problem.system.separable else "steps of its own, such as 'dop853'"
+    own = "steps of its own, such as 'dop853'"
+    if problem.system.separable:
+        own = "a clock of its own, such as 'log_leapfrog'"
     return f"Reduce `dt`, soften H there, or take a method with {own}"
 
 

@@ -179,8 +179,8 @@ def check_memory(integrator: Integrator, problem: Problem) -> None:
                 "which suit its motion: pass a shorter one. "
             )
         raise ValueError(
-            f"{own}`t_eval` is not given, so {values:.3g} values ({values * 8 / 2**30:.3g} GiB) would be stored, more than "
-            f"{MAX_SAVED_VALUES:.0e}: choose the times with `t_eval`, or thin them with `save_every`"
+            f"{own}`t_eval` is not given, so {values:.3g} values ({values * 8 / 2**30:.3g} GiB) would be stored, more "
+            f"than {MAX_SAVED_VALUES:.0e}: choose the times with `t_eval`, or thin them with `save_every`"
             f"{', or leave dense_output out' if problem.dense_output else ''}."
         )
 
