@@ -327,10 +327,12 @@ def _check_outputs(integrator: Integrator, problem: Problem, tol: float) -> None
     try:
         check_memory(integrator, problem)
     except ValueError as error:
+        other, why = choose_method(problem.system, problem.y0, {}, tol, flows=False)
+        remedy = f"take one of higher order{f', or {other.label!r} ({why})' if other.in_another_time else ''}"
         what = "of the states, as always on the logarithmic clock, " if integrator.in_another_time else ""
         raise ValueError(
             f"`tol` {tol:g} {what}needs very short steps of method {integrator.label!r}, of order {integrator.order}: "
-            f"take one of higher order, or a larger `tol`. {error}"
+            f"{remedy}, or a larger `tol`. {error}"
         ) from error
 
 

@@ -3,6 +3,7 @@
 import importlib
 import math
 import pickle
+import re
 import warnings
 
 import numpy as np
@@ -458,3 +459,34 @@ def test_a_run_of_few_steps_that_are_far_too_long_is_told(dt):
     ) as told:
         solve(system, "verlet", (0, 10), dt=dt)
     assert told[0].filename == __file__  # the line of the user
+
+
+def test_a_time_that_is_no_time_of_the_system_is_told_before_outputs():
+    """An electron in a trap of atomic size in SI units, 3e18 rad/s, over the 100 s of no `t_span`."""
+    with pytest.raises(ValueError, match=r"^`t_span` \(0, 100\), the system's, is 6\.67e\+18 steps .*: pass a shorter"):
+        solve(H("p**2/(2*m) + k*q**2/2", params={"m": 9.1e-31, "k": 10.0}, y0=[1e-10, 0]))
+
+
+def test_a_close_encounter_is_no_matter_of_outputs():
+    text = "(p1**2 + p2**2)/2 - 1/sqrt(q1**2 + q2**2)"
+    with pytest.raises(ValueError, match=r"^`tol` 1e-06 needs .*, or 'log_kahan_li8' \(V falls without bound at q = 0"):
+        solve(H(text, y0=[1, 0, 0, 1e-3]), "verlet", (0, 100), tol=1e-6)
+    assert sympflow.max_energy_error(solve(H(text, y0=[1, 0, 0, 1e-3]), "log_kahan_li8", (0, 100), dt=0.05)) < 1e-6
+
+
+@pytest.mark.parametrize(("method", "dt"), [("verlet", 0.21), ("verlet", 0.05), ("euler", 0.001)])
+def test_a_warning_has_the_energy_error_of_the_run(method, dt):
+    with pytest.warns(RuntimeWarning, match="the energy of the run is off by") as told:
+        sol = solve(H("p**2/2 + 100*q**2", y0=[1, 0]), method, (0, 1.05), dt=dt)
+    off = float(re.search(r"off by (\S+) %", str(told[0].message))[1]) / 100
+    assert 0.9 < off / sympflow.max_energy_error(sol) < 1.1
+
+
+def test_a_pole_of_what_is_not_separable_has_a_remedy_that_works():
+    system = H("p1*q2 - p2*q1 + p1**2/2 + p2**2/2 + 1/q1", y0=[1, 0, 0, 1])
+    sol = solve(system, "gauss_legendre6", (0, 10))
+    assert sol.status == -1
+    assert "such as 'dop853'" in sol.message
+    assert "log_leapfrog" not in sol.message
+    fine = solve(system, "dop853", (0, 10), rtol=1e-10, atol=1e-12)
+    assert sympflow.max_energy_error(fine) < 1e-6

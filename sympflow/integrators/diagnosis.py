@@ -16,7 +16,7 @@ import numpy as np
 from sympflow.arguments import warn
 from sympflow.arrays import Array, finite_states, has_values, is_tensor, masked, one_lane, readable, to_numpy
 from sympflow.hamiltonian.domain import Box, Domain, EnergySublevel
-from sympflow.hamiltonian.scales import rate_of_motion
+from sympflow.hamiltonian.scales import known_scale, rate_of_motion
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep
 from sympflow.integrators.contract import Integrator, Outcome, Problem
@@ -276,7 +276,10 @@ def _passage(poles: Poles, t: np.ndarray, y: np.ndarray, scale: float) -> Passag
 def _remedy(integrator: Integrator, problem: Problem) -> str:
     if integrator.step_length(problem.system) is None:
         return "Reduce `rtol` and `atol`, or soften H there"
-    return "Reduce `dt`, soften H there, or take a method with a clock of its own, such as 'log_leapfrog'"
+    own = "steps of its own, such as 'dop853'"
+    if problem.system.separable:
+        own = "a clock of its own, such as 'log_leapfrog'"
+    return f"Reduce `dt`, soften H there, or take a method with {own}"
 
 
 def _which(problem: Problem, rows: list[int], values: ParameterRows | None) -> str:
@@ -402,11 +405,13 @@ def _energy_off(outcome: Outcome, problem: Problem, seen: int, each: bool) -> fl
             change = np.abs(H - H[0])
             if not (change > TOO_LONG * np.abs(H[0])).any():
                 return 0.0
-            size = 0.5 * np.abs(y * np.asarray(functions.gradient(y, **numbers))).sum(-1)
-            size = size if each else size.max(0)
+            sizes = 0.5 * np.abs(y * np.asarray(functions.gradient(y, **numbers))).sum(-1)
+            size = sizes if each else sizes.max(0)
         except (ArithmeticError, ValueError, TypeError):  # a function that takes no batches
             return 0.0
         off = np.fmax.reduce(change / np.maximum(size, system.energy_scale or 0.0), axis=None)  # of a rest 0/0
+        if off > TOO_LONG:  # told as the energy error of the run
+            off = np.fmax(off, np.fmax.reduce(change / known_scale(system, H, sizes), axis=None))
     if np.isfinite(H[0]).all() and np.isinf(change).any():
         return math.inf
     return float(off) if off < math.inf else 0.0

@@ -172,9 +172,15 @@ def check_memory(integrator: Integrator, problem: Problem) -> None:
     stored = n_steps if problem.dense_output else n_steps / problem.save_every
     values = (stored + 1) * size
     if values > MAX_SAVED_VALUES:
+        system, own = problem.system, ""
+        if (problem.t0, problem.t1) == system.t_span and length > 0.5 * system.dt:
+            own = (
+                f"`t_span` ({problem.t0:g}, {problem.t1:g}), the system's, is {n_steps:.3g} steps of {length:.3g}, "
+                "which suit its motion: pass a shorter one. "
+            )
         raise ValueError(
-            f"`t_eval` is not given, so {values:.3g} values ({values * 8 / 2**30:.3g} GiB) would be stored, more than "
-            f"{MAX_SAVED_VALUES:.0e}: choose the times with `t_eval`, or thin them with `save_every`"
+            f"{own}`t_eval` is not given, so {values:.3g} values ({values * 8 / 2**30:.3g} GiB) would be stored, more "
+            f"than {MAX_SAVED_VALUES:.0e}: choose the times with `t_eval`, or thin them with `save_every`"
             f"{', or leave dense_output out' if problem.dense_output else ''}."
         )
 
