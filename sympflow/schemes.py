@@ -159,12 +159,14 @@ class Scheme:
             )
         if self.polynomials and (any(self.gradients) or any(self.curvatures)):
             raise ValueError("`polynomials` stand in place of `gradients` and `curvatures`: leave these out.")
-        # made once: tables are looked up by their scheme in every run
-        made = hash((self.name, self.kicks, self.drifts, self.gradients, self.curvatures))
-        object.__setattr__(self, "_hash", made)
 
     def __hash__(self) -> int:
-        return vars(self)["_hash"]
+        return self._hash
+
+    @cached_property
+    def _hash(self) -> int:
+        """Made once: tables are looked up by their scheme in every run."""
+        return hash((self.name, self.kicks, self.drifts, self.gradients, self.curvatures))
 
     @cached_property
     def substeps(self) -> tuple[Substep, ...]:
