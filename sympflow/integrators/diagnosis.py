@@ -706,7 +706,8 @@ def warn_of_loss(outcome: Outcome, integrator: Integrator, system: HamiltonianSy
         return
     width = 2 * system.ndof
     with np.errstate(all="ignore"):
-        y = to_numpy(outcome.y[:: -max(1, len(outcome.y) // LOOKED_AT)] if readable(outcome.y) else outcome.y[-1:])
+        y = to_numpy(outcome.y if readable(outcome.y) else outcome.y[-1:])
+        y = y[:: -max(1, len(y) // LOOKED_AT)]
         H0, H = system.hamiltonian(to_numpy(y0).reshape(-1, width)), system.hamiltonian(y.reshape(len(y), -1, width))
         error = np.fmax.reduce(np.abs(H - H0) / (system.energy_scale or np.maximum(np.abs(H0), np.abs(H))))
     certificate, figures = flow.certified, flow.figures

@@ -133,8 +133,9 @@ def test_a_flow_that_is_wrong_outside_its_domain_warns():
     system = HamiltonianSystem.from_sympy("p**2/2 + q**2/2 + q**4/4", domain=box)
     flow = train(system, restarts=1, steps=5, points=40)
     assert "left the domain" in solve(system, flow, (0, 50), [0.9, 0.9]).message  # and is right there
-    with pytest.warns(RuntimeWarning, match=r"^The state left the domain .* the flow has an error in one step of"):
-        solve(system, flow, (0, 50), [3.0, 3.0])
+    for y0 in ([3.0, 3.0], torch.tensor([3.0, 3.0], dtype=torch.float64, requires_grad=True)):
+        with pytest.warns(RuntimeWarning, match=r"^The state left the domain .* the flow has an error in one step of"):
+            solve(system, flow, (0, 50), y0)
 
 
 @pytest.mark.parametrize("flow", ["henon_heiles-mlp", "henon_heiles-sympflow"])
