@@ -71,7 +71,7 @@ def cosines_alone() -> Callable[[float, float, int], float]:
     with code.over(n) as k:
         total.value = total.value + apply("cos", step * code.convert("sitofp", k, "double"))
     code.store(total.value, numbers, 1)
-    function = finished(code, types)
+    function = finished(code)
 
     def cosines(w: float, h: float, n: int) -> float:
         numbers = np.array([w * h, 0.0])

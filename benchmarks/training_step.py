@@ -67,15 +67,15 @@ def mean_square(system: HamiltonianSystem, y: Tensor, velocity: Tensor) -> Tenso
 
 
 def double_autodiff(flow: SympFlow, system: HamiltonianSystem, points: Points) -> Tensor:
-    t = points.t.detach().requires_grad_()
-    y = autodiff_map(flow, published_value, t, points.x.detach().requires_grad_())
+    t, x = (each.detach().requires_grad_() for each in points.residual)
+    y = autodiff_map(flow, published_value, t, x)
     velocity = [torch.autograd.grad(y_i.sum(), t, create_graph=True)[0] for y_i in y.unbind(-1)]
     return mean_square(system, y, torch.stack(velocity, -1))
 
 
 def better_double_autodiff(flow: SympFlow, system: HamiltonianSystem, points: Points) -> Tensor:
-    t = points.t.detach().requires_grad_()
-    y = autodiff_map(flow, columns_value, t, points.x.detach().requires_grad_())
+    t, x = (each.detach().requires_grad_() for each in points.residual)
+    y = autodiff_map(flow, columns_value, t, x)
     # uᵀ∂_ty is linear in u, so its derivative in u is ∂_ty: two reverse passes in place of one a component.
     u = torch.ones_like(y, requires_grad=True)
     (along_u,) = torch.autograd.grad(y, t, u, create_graph=True)
