@@ -235,7 +235,7 @@ def leaves(values: Tensor) -> list[Tensor]:
     while waiting:
         if (node := waiting.pop()) is not None and node not in met:
             met.add(node)
-            found += [node.variable] if hasattr(node, "variable") else []
+            found += [node.variable] if node.name().endswith("AccumulateGrad") else []
             waiting += [parent for parent, _ in node.next_functions]
     return found
 
