@@ -189,6 +189,19 @@ def test_worst_ratio_compares_equal_targets_only():
     assert worst_ratio(results, "torch", 1) is None
 
 
+def test_numbers_are_written_with_three_digits():
+    assert [fragments.three(x) for x in (0.001234, 1.0, 12.34, 123.4, 123456.0)] == [
+        "0.00123",
+        "1.00",
+        "12.3",
+        "123",
+        "123,000",
+    ]
+    assert [fragments.duration(s) for s in (2.5, 0.0123, 4.56e-5, 3e-9)] == ["2.50 s", "12.3 ms", "45.6 µs", "3.00 ns"]
+    assert tables.power(1e-3) == "1e-3"
+    assert tables.power(1e-12) == "1e-12"
+
+
 def test_a_missing_peer_is_a_line_with_the_reason(monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     contenders, skipped = peers.gather(TINY)
@@ -229,6 +242,20 @@ def test_a_fragment_says_where_it_is_from(tmp_path, monkeypatch):
     )
     assert fragments.command_line("--only kepler").endswith("drift.py --quick --steps 9 --only kepler")
     fragments.write(None, "two", "")  # printed only
+
+
+def test_every_fragment_has_a_command_that_writes_it():
+    """The names in the sources; stability, ideas, driven and brought systems put a prefix before their sections."""
+    sources = "".join(path.read_text(encoding="utf-8") for path in BENCHMARKS.rglob("*.py"))
+    for path in (BENCHMARKS.parent / "docs" / "measured").glob("*.md"):
+        if path.stem == "flows":  # the table of `sympflow flows`
+            continue
+        section = re.sub(r"^(stability|ideas|driven|bring)-", "", path.stem)
+        section = re.sub(r"^stiff-fput-\d+", "stiff-fput-", section)
+        section = re.sub(r"^peers-(one|batch)", "peers-", section)
+        section = re.sub(r"^large-flows-\d+", "large-flows", section)
+        stem = section.removesuffix("-against").removesuffix("-flow").removesuffix("-work")
+        assert f'"{section}"' in sources or f'"{stem}' in sources, path.name
 
 
 def test_fragments_are_made_again_by_their_commands(tmp_path, monkeypatch):

@@ -237,6 +237,15 @@ def stands_in(figure, others):
     return any(abs(value - float(plain)) <= 0.5000001 * unit for value in values)
 
 
+def test_a_figure_stands_where_it_is_or_is_rounded_from():
+    assert stands_in("3.8", ["3.79", "12"])
+    assert stands_in("1.0e-08", ["1.02e-8"])
+    assert stands_in("8,000", ["8000"])
+    assert not stands_in("3.7", ["3.79"])
+    assert not stands_in("5.4e-7", ["5.5e-07"])
+    assert figures("takes 1,243,312 steps, 2.3 to 4e-5 s") == ["1,243,312", "2.3", "4e-5"]
+
+
 @pytest.mark.parametrize(
     "page", [page for page in PAGES if QUOTES.search(page.read_text("utf-8"))], ids=lambda p: p.stem
 )

@@ -129,6 +129,11 @@ class TestTrajectories:
         ):
             solve(damped, "verlet", (0, 1), [1.0, 0.0], params={"damping": [0.1, 0.2]}, dt=0.1)
 
+    def test_pickles(self, system, y0):
+        sol = solve(system, "verlet", (0, 1), y0, params={"lam": LAM}, dt=0.25)
+        again = pickle.loads(pickle.dumps(sol))
+        np.testing.assert_array_equal(again.energy_error(), sol.energy_error())
+
 
 class TestMetrics:
     @pytest.mark.parametrize(

@@ -95,6 +95,12 @@ def test_a_million_steps_store_what_was_asked_for():
 ESCAPE = {"t_span": (0, 20), "y0": [0, 0, 0, 0.7]}  # the singularity is at t* = 5.450984210235402
 
 
+def test_a_tensor_that_blows_up():
+    sol = solve(HH, "verlet", (0, 20), y0=torch.tensor(ESCAPE["y0"], dtype=torch.float64), dt=0.01)
+    assert sol.status == -1
+    assert torch.isfinite(sol.y).all()
+
+
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("value", [1e308, 1e200, 5e-324])
 def test_extreme_states_end_at_once(method, value):
@@ -275,6 +281,21 @@ def test_a_system_works_in_solve_ivp_and_odeint():
     np.testing.assert_allclose(y, exact(5.0), atol=1e-5)
     y = odeint(HH, torch.tensor(HH.y0), torch.tensor([0.0, 5.0], dtype=torch.float64))[-1]
     np.testing.assert_allclose(y, exact(5.0), atol=1e-5)
+
+
+def test_general_kinetic_energies():
+    masses = HamiltonianSystem.from_sympy("p1**2/4 + p1*p2/5 + p2**2/6 + q1**4 + q1*q2 + q2**2", y0=[1, 0, 0, 1])
+    relativistic = HamiltonianSystem.from_sympy("sqrt(1 + p**2) + q**4", y0=[1, 0.5])
+    for system, method, close in (
+        (masses, "kahan_li8", 1e-9),
+        (masses, "srkn11b", 1e-8),
+        (relativistic, "kahan_li8", 1e-9),
+    ):
+        reference = solve(system, "dop853", (0, 3), t_eval=[3.0], rtol=1e-12, atol=1e-13).y
+        sol = solve(system, method, (0, 3), t_eval=[3.0], backend="array")
+        np.testing.assert_allclose(sol.y, reference, rtol=0, atol=close)
+    with pytest.raises(ValueError, match=r"^`method` 'srkn11b' needs a kinetic energy"):
+        solve(relativistic, "srkn11b")
 
 
 def test_y0_may_be_a_parameter_of_torch():

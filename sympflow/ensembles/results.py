@@ -94,7 +94,10 @@ class Variable:
 
 @dataclass(frozen=True)
 class Layout:
-    """The axes of an ensemble, `n` orbits at each of their values, and the fields that are kept of each orbit."""
+    """The axes of an ensemble, `n` orbits at each of their values, and the fields that are kept of each orbit.
+
+    `state` is the field that holds states [q, p] along its first axis; "" if there is none.
+    """
 
     axes: dict[str, np.ndarray]
     n: int

@@ -494,7 +494,11 @@ class _Search:
         return None if found is None else found[1]
 
     def _first(self, most: int, steps: int) -> list[int]:
-        """The best fit of several regressions; pieces are shortened until one of them does not diverge."""
+        """The best model of several regressions whose predictions do not diverge; pieces are shortened until it is so.
+
+        Where terms are nearly alike, as cosines, powers and distances, adding them one at a time ends elsewhere than
+        dropping them, and than the same among a part of the library. The best of the regressions are fitted.
+        """
         regression = Regression.of_slopes(self.library, self.smooth, self.data.scales)
         most = min(most, self.most_terms)
         found = [way(most, part) for part in self._parts() for way in (regression.forward, regression.backward)]

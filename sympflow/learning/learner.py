@@ -152,7 +152,9 @@ def learn(
     constraints = _constraints(data, separable, mass, damping, period, known)
     frequencies = () if isinstance(drive, bool) else tuple(floats("drive", drive).ravel().tolist())
     if not all(0 < frequency < math.inf for frequency in frequencies):
-        raise ValueError(f"`drive` must be True, to find frequencies, a positive one, several or False; got {drive!r}.")
+        raise ValueError(
+            f"`drive` must be True, for frequencies that are found, a positive one or several, or False; got {drive!r}."
+        )
     huber = limit_of(loss)
     check_dt(dt)
     session = Session(checkpoint, resume, plain(time_budget), progress, callback, WorkerPool(workers))

@@ -139,7 +139,16 @@ FINE = 1.05 ** np.arange(-150, 280)
 
 
 def states_of_energy(system: HamiltonianSystem, energy: float, n: int, plane: Plane, seed: int = 0) -> np.ndarray:
-    """n states (n, 2d) on a plane with H = energy, which cross it in its direction; a ValueError if none is found."""
+    """Return n states (n, 2d) on a plane with H = energy, which cross it in its direction.
+
+    They lie on rays from the lowest of a few states on the plane, within the first place where the energy is reached;
+    the coordinate that is conjugate to that of the plane then makes up for the rest of the energy.
+
+    Raises
+    ------
+    ValueError
+        If the system is driven, or no state of this energy is found.
+    """
     system.check_autonomous("so no `energy` is that of an orbit", "pass `y0`")
     checked_number("energy", energy, "a finite number, a value of H")
     check_counts(n=n)

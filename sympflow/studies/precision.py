@@ -185,14 +185,21 @@ class Conditions:
         return measure_of(self.system)
 
     def run(self, integrator: Any, t_span: tuple[float, float] | None = None, t: np.ndarray | None = None) -> Solution:
-        """The solution from all initial states, or of a method that takes them one by one from a few."""
+        """The solution from all initial states, or of a method that takes them one by one from a few.
+
+        Over another interval if that is given.
+        """
         y0 = self.y0[:SAMPLE] if integrator.one_by_one and self.trajectories > SAMPLE else self.y0
         times = self.t if t is None else t
         return solve(self.system, integrator, t_span or self.t_span, y0, t_eval=times, backend=self.backend)
 
 
 def _measure(
-    conditions: Conditions, swept: Sequence[Any], repeats: int, budget: float, say: Callable[[str], None]
+    conditions: Conditions,
+    swept: list[tuple[Candidate, list[Any]]],
+    repeats: int,
+    budget: float,
+    say: Callable[[str], None],
 ) -> tuple[list[Row], Reference | None]:
     """All points for one set of initial states."""
     scene = f"{conditions.system.name}, {conditions.trajectories} trajectories"
@@ -287,7 +294,11 @@ def _figure(point: Row, measure: str) -> float:
 
 
 def cost_at(points: Sequence[Row], error: float, cost: str = "run_time", measure: str = "energy_error") -> float:
-    """The cost of one method for an error, by interpolation of the logarithms; inf if no point is accurate enough."""
+    """Return the cost of one method for an error: between two of its points by interpolation of the logarithms.
+
+    The cheapest point that is more accurate is taken where that costs less; inf if no point is accurate enough. A step
+    or a tolerance is the largest that reaches the error.
+    """
     known = [(getattr(p, measure), getattr(p, cost)) for p in points]
     known = sorted((e, c) for e, c in known if e and c and math.isfinite(e))
     best = max if cost in SETTINGS else min

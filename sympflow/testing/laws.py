@@ -45,7 +45,9 @@ def start(system: HamiltonianSystem) -> np.ndarray:
     return system.y0
 
 
-def run(integrator: Integrator, system: HamiltonianSystem, t_span: Any, y0: Any = None, **arguments: Any) -> Solution:
+def run(
+    integrator: Integrator, system: HamiltonianSystem, t_span: tuple[float, float], y0: Any = None, **arguments: Any
+) -> Solution:
     """A solution of the integrator's, from the system's y0 unless another is given."""
     y0 = start(system) if y0 is None else y0
     with warnings.catch_warnings():  # the methods of low order are judged by their laws, at any step
@@ -101,7 +103,9 @@ def a_step_length_for_each_state(integrator: Integrator, system: HamiltonianSyst
     together = step(y, h)
     assert together.shape == y.shape, f"a step of states {y.shape} has shape {together.shape}"
     for i in range(3):
-        assert_close(together[i], step(y[i], h[i]), 1e3 * EPS, f"state {i} of a batch with its own h differs alone")
+        assert_close(
+            together[i], step(y[i], h[i]), 1e3 * EPS, f"state {i} of a batch with its own h differs from alone"
+        )
         assert_close(together[i], step(y[i], float(h[i])), 1e3 * EPS, "h as a number or an array differs")
 
 
@@ -319,7 +323,9 @@ def both_directions(integrator: Integrator, system: HamiltonianSystem) -> None:
         raise NotApplicable(f"it has no backward time ({error})") from error
     assert back.t[0] == T_END and back.t[-1] == 0.0, f"t runs from {back.t[0]} to {back.t[-1]}"
     missed, allowed = np.abs(back.y[:, -1] - start(system)).max(), np.abs(there - exact(system)).max()
-    assert missed <= 20 * allowed + 1e-10, f"backward time misses y0 by {missed:.1e}; its own error is {allowed:.1e}"
+    assert missed <= 20 * allowed + 1e-10, (
+        f"backward time misses y0 by {missed:.1e}; the method's error is {allowed:.1e}"
+    )
 
 
 def an_empty_interval(integrator: Integrator, system: HamiltonianSystem) -> None:
@@ -373,7 +379,10 @@ def events_are_zeros_of_the_dense_output(integrator: Integrator, system: Hamilto
 
 
 def statistics(integrator: Integrator, system: HamiltonianSystem) -> None:
-    """The numbers of steps, forces and Hessians, and the backend are reported; a step's are those of the system."""
+    """n_steps, force_evaluations, hessian_evaluations and backend are reported, as counts and a word.
+
+    Only a trained flow evaluates no forces. The count for one step is that of the step on the system's own functions.
+    """
     stats = run(integrator, system, (0.0, T_END)).stats
     for key in ("n_steps", "force_evaluations", "hessian_evaluations", "backend"):
         assert key in stats, f"stats lack {key!r}"
@@ -467,7 +476,9 @@ def states_within_a_step_belong_to_it(integrator: Integrator, system: Hamiltonia
     if isinstance(integrator, FixedStep) and integrator.on_grid and bare_step(integrator, system) is None:
         with np.errstate(all="ignore"):
             expected = np.asarray(integrator.step(system, 0.0, y, fractions * h))[within]
-        assert_close(inside, expected, 1e4 * EPS, "a state within a step is not the shorter step there, but away")
+        assert_close(
+            inside, expected, 1e4 * EPS, "a state within a step is not the shorter step from its beginning, but away"
+        )
         return
     reference = solve(system, "dop853", (0.0, T_END), start(system), dense_output=True, rtol=1e-12, atol=1e-14).sol
     assert reference is not None

@@ -53,7 +53,7 @@ def test_methods_of_high_order_keep_it_at_kinks_in_t(drive):
         lambda s, y: [y[1], force(s) - y[0]], (0, 12), [1, 0], "DOP853", ends, rtol=1e-13, atol=1e-13, max_step=2e-3
     )
     sol = solve(made(f"p**2/2 + q**2/2 - q*({drive})", time="t"), "kahan_li8", (0, 12), [1, 0], dt=0.05, t_eval=ends)
-    np.testing.assert_allclose(sol.y, exact.y, atol=1e-9)
+    np.testing.assert_allclose(sol.y, exact.y, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -66,7 +66,8 @@ def test_kinks_of_functions_are_met(drive):
     system = HamiltonianSystem(
         potential=lambda s, q: q[..., 0] ** 2 / 2 - q[..., 0] * drive(s), ndof=1, time=True, y0=[1, 0]
     )
-    np.testing.assert_allclose(solve(system, "kahan_li8", (0, 9), dt=0.05).y[:, -1], exact.y[:, -1], atol=1e-10)
+    sol = solve(system, "kahan_li8", (0, 9), dt=0.05)
+    np.testing.assert_allclose(sol.y[:, -1], exact.y[:, -1], rtol=0, atol=1e-10)
 
 
 def test_a_batch_of_parameters_has_outputs_at_common_times():
@@ -82,17 +83,17 @@ def test_kinks_of_samples_are_met():
     exact = solve_ivp(
         lambda s, y: [y[1], max(a(s), 0) - y[0]], (0, 20), [1, 0], "DOP853", rtol=1e-12, atol=1e-12, max_step=1e-2
     )
-    np.testing.assert_allclose(sol.y[:, -1], exact.y[:, -1], atol=1e-8)
+    np.testing.assert_allclose(sol.y[:, -1], exact.y[:, -1], rtol=0, atol=1e-8)
 
 
 def test_the_force_of_a_triangle_wave_is_that_of_its_sides():
     q = np.array([5.0, 1.0, -1.0, 2.0, 7.0])
     system = made("p**2/2 + asin(sin(q)) + 10*acos(cos(q))")
     y = np.stack([q, 0 * q], axis=-1)
-    np.testing.assert_allclose(system.gradient(y)[:, 0], np.sign(np.cos(q)) + 10 * np.sign(np.sin(q)))
-    np.testing.assert_allclose(system.hamiltonian(y), np.arcsin(np.sin(q)) + 10 * np.arccos(np.cos(q)))
+    np.testing.assert_allclose(system.gradient(y)[:, 0], np.sign(np.cos(q)) + 10 * np.sign(np.sin(q)), rtol=1e-14)
+    np.testing.assert_allclose(system.hamiltonian(y), np.arcsin(np.sin(q)) + 10 * np.arccos(np.cos(q)), rtol=1e-14)
     sol = solve(system, "verlet", (0, 0.1), y, dt=0.1)
-    np.testing.assert_allclose(sol.y[:, 0, -1], q - 0.005 * system.gradient(y)[:, 0])
+    np.testing.assert_allclose(sol.y[:, 0, -1], q - 0.005 * system.gradient(y)[:, 0], rtol=1e-14)
 
 
 # impulses ------------------------------------------------------------------------------------------

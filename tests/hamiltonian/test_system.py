@@ -88,6 +88,14 @@ def test_numpy_functions_do_not_need_torch_when_the_gradient_is_given():
         system.potential_hessian(np.array([0.5]))
 
 
+def test_hessian_from_hessian_vector_products():
+    system = HamiltonianSystem(
+        lambda q: (q**3).sum(-1), gradient=lambda q: 3 * q**2, hessian_vector=lambda q, v: 6 * q * v, ndof=2
+    )
+    q = np.array([[0.5, 2.0], [1.0, 3.0]])
+    np.testing.assert_array_equal(system.potential_hessian(q), [np.diag([3.0, 12.0]), np.diag([6.0, 18.0])])
+
+
 def numba_pendulum(with_hessian=True):
     @njit
     def potential(q):
@@ -172,6 +180,11 @@ class TestNumbaFunctions:
         for q in (np.zeros(2), torch.zeros(2)):
             with pytest.raises(ValueError, match=r"^`hessian_vector` is needed here"):
                 system.potential_hessian(q)
+
+    def test_can_be_copied(self):
+        self.system.force(torch.zeros(2))
+        same = pickle.loads(pickle.dumps(self.system))
+        torch.testing.assert_close(same.force(torch.ones(2)), self.system.force(torch.ones(2)))
 
 
 @pytest.mark.parametrize(

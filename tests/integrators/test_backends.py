@@ -99,6 +99,12 @@ def test_sines_of_far_states_stay_bounded(q):
     assert abs(sol.p[0, -1]) <= 0.01 * (1 + 1e-15)  # |force| <= 1
 
 
+def test_steps_are_counted_once():
+    sol = solve(HH, "verlet", (0.0, 10.0), dt=0.1, t_eval=[0.05, 10.0])
+    assert sol.stats["n_steps"] == 100
+    assert solve(HH, "verlet", (0.0, 10.03), dt=0.1).stats["n_steps"] == 101
+
+
 BODIES = HamiltonianSystem.pairs("-m1*m2/r", masses=[1.0, 0.5, 0.3], dim=2)
 CLUSTER = HamiltonianSystem.pairs("-m1*m2/sqrt(r**2 + 0.01)", masses=np.linspace(1.0, 2.0, 10), dim=2, damping=0.1)
 CHAIN = HamiltonianSystem.lattice(

@@ -236,6 +236,12 @@ def test_drifts_back_in_time_bound_the_step():
 # every method --------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("name", [m for m in sympflow.available() if not sympflow.get(m)().takes_friction])
+def test_methods_that_take_no_friction_refuse_it(name):
+    with pytest.raises(ValueError, match=r"^`system` 'damped_pendulum' has friction, .* use a splitting method"):
+        solve(damped_pendulum(0.5), name, (0, 1.0))
+
+
 class Field(FixedStep):
     """A method of a third party that steps by the vector field and says nothing of friction."""
 

@@ -397,12 +397,11 @@ def field_with_extra(t, y, k):
 )
 def test_other_methods_have_compiled_steps_with_an_extra_potential(method, dt):
     """Whose parameters are values that `with_params` changes; steps are so short that k = 1e-5 counts 20 times more."""
-    for k in (2e-5,):
-        system = EXTRA.with_params(k=k)
-        runs = [solve(system, method, (0, 1000.0), dt=dt, backend=b) for b in ("compiled", "array")]
-        assert np.abs(runs[0].y - runs[1].y).max() < 1000 / dt * 40 * EPS * np.abs(system.y0).max()
-        exact = solve_ivp(field_with_extra, (0, 1000.0), system.y0, "DOP853", args=(k,), rtol=1e-12, atol=1e-15)
-        assert np.abs(runs[0].y[:, -1] - exact.y[:, -1])[:12].max() < 1e-5
+    system = EXTRA.with_params(k=2e-5)
+    runs = [solve(system, method, (0, 1000.0), dt=dt, backend=b) for b in ("compiled", "array")]
+    assert np.abs(runs[0].y - runs[1].y).max() < 1000 / dt * 40 * EPS * np.abs(system.y0).max()
+    exact = solve_ivp(field_with_extra, (0, 1000.0), system.y0, "DOP853", args=(2e-5,), rtol=1e-12, atol=1e-15)
+    assert np.abs(runs[0].y[:, -1] - exact.y[:, -1])[:12].max() < 1e-5
 
 
 def test_any_star_and_bodies_in_pairs_are_planets():
@@ -566,8 +565,8 @@ def test_bad_arguments_of_elements(call, error, message):
     [
         (
             SOLAR,
-            {"method": "wisdom_holman", "dt": 12.0, "t_span": (0, 800.0)},
-            "`dt` 12 is long .* body 1, 87.97, apart",
+            {"method": "wisdom_holman", "dt": 8.0, "t_span": (0, 800.0)},
+            "`dt` 8 is long .* body 1, 87.97, apart",
         ),
         (systems.outer_solar_system(), {"method": "wisdom_holman", "t_span": (0, 2e4)}, "cross, .* bodies 4 and 5"),
     ],
@@ -595,8 +594,8 @@ def test_a_star_may_have_bodies_without_mass_alone(method):
     system = HamiltonianSystem.planets([1.0, 0.0, 0.0], elements={"a": [1.0, 2.0], "e": 0.3})
     ends = 2 * np.pi * np.array([1.0, 2.0**1.5])
     y = solve(system, method, (0, ends[1]), t_eval=ends).y
-    np.testing.assert_allclose(y[3:6, 0], system.y0[3:6], atol=1e-12)
-    np.testing.assert_allclose(y[6:9, 1], system.y0[6:9], atol=1e-12)
+    np.testing.assert_allclose(y[3:6, 0], system.y0[3:6], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(y[6:9, 1], system.y0[6:9], rtol=0, atol=1e-12)
 
 
 def test_elements_have_names():
@@ -605,11 +604,12 @@ def test_elements_have_names():
 
 
 @pytest.mark.parametrize("dt", [5.0, 8.0])
-def test_usual_steps_of_the_solar_system_are_no_reason_to_warn(dt):
+def test_usual_steps_of_the_solar_system_are_warned_of_and_right(dt):
     """Kicks eleven times in a period of Mercury: in ten years it stays within 1e-5 of its place."""
     system = systems.solar_system()
     right = solve(system, "dop853", (0, 3652.5), t_eval=[3652.5], rtol=1e-12, atol=1e-15).y[3:6, 0]
-    found = solve(system, "wisdom_holman", (0, 3652.5), dt=dt, corrector=17, t_eval=[3652.5]).y[3:6, 0]
+    with pytest.warns(RuntimeWarning, match="more than a twentieth of the period of body 1"):
+        found = solve(system, "wisdom_holman", (0, 3652.5), dt=dt, corrector=17, t_eval=[3652.5]).y[3:6, 0]
     assert np.linalg.norm(found - right) < 1e-5 * np.linalg.norm(right)
 
 

@@ -161,6 +161,22 @@ def test_symplectic_euler_is_neither_symmetric_nor_shared_between_steps():
     assert not Scheme("lopsided", None, (0.25, 0.75), (1.0, 0.0), (0.0, 0.0), "").symmetric
 
 
+EVALUATIONS = {
+    **{"verlet": (1, 0), "leapfrog": (1, 0), "yoshida4": (3, 0), "yoshida6": (7, 0), "suzuki4": (5, 0)},
+    **{"mclachlan4": (5, 0), "blanes_moan4": (6, 0), "kahan_li6": (9, 0), "kahan_li8": (17, 0)},
+    **{"srkn6b": (6, 0), "srkn11b": (11, 0), "srkn14a": (14, 0), "aba104": (7, 0), "aba864": (7, 0), "aba1064": (8, 0)},
+    **{"chin4a": (2, 1), "chin4c": (3, 1), "omelyan4": (3, 1), "omelyan6": (5, 3)},
+}
+"""Forces and force gradients of a step, as the papers count them."""
+
+
+def test_evaluations_per_step():
+    for name, counts in EVALUATIONS.items():
+        scheme = SCHEMES[name]
+        assert scheme.first_same_as_last
+        assert (scheme.force_evaluations, scheme.hessian_evaluations) == counts, name
+
+
 def test_a_shared_kick_with_a_gradient_is_counted_once():
     table = Scheme("primed", None, (0.5, 0.5), (1.0, 0.0), (0.01, 0.01), "", nystrom=True)
     assert (table.force_evaluations, table.hessian_evaluations) == (1, 1)

@@ -83,6 +83,8 @@ class TestEveryKind:
         assert n == np.ceil(np.diff(coarse.t)[0] / 0.04 - 1e-9)
         np.testing.assert_allclose(fine.y[:, ::n], coarse.y, atol=200 * EPS)
         np.testing.assert_allclose(fine.sol(fine.t), fine.y, atol=200 * EPS)
+        none = solve_ivp(HH, (2, 2), HH.y0, method=solver(method), dense_output=True)
+        np.testing.assert_array_equal([none.y[:, -1], none.sol(2.0)], [HH.y0, HH.y0])
 
 
 @pytest.fixture

@@ -154,3 +154,23 @@ def test_a_resonance_of_the_impulse_method_is_a_window():
     outside = h[np.abs(np.cos(5 * h) + h / 10 * np.sin(5 * h)) > 1]
     assert found.windows[0].start == pytest.approx(outside[0], abs=2e-4)
     assert found.windows[0].stop == pytest.approx(outside[-1], abs=2e-4)
+
+
+BOUNDS = {"verlet": lambda z: z**2 / 4, "leapfrog": lambda z: z**2 / 4 / (1 - z**2 / 4)}
+
+
+@pytest.mark.parametrize(
+    ("method", "omega", "z"),
+    [("verlet", 1.0, 1.99), ("verlet", 1e6, 0.1), ("leapfrog", 1e3, 1.9), ("leapfrog", 1e6, 1.99)],
+)
+def test_the_energy_error_approaches_its_bound_and_stays_below(method, omega, z):
+    """And beyond the limit the state grows by the root of λ² − 2cλ + 1, c = 1 − z²/2."""
+    error = max_energy_error(solve(systems.harmonic_oscillator(omega), method, (0.0, 1e5 * z / omega), dt=z / omega))
+    bound = BOUNDS[method](z)
+    # rounding of 1e5 steps, amplified by the eccentricity of the ellipse that the iterates lie on
+    assert 0.99 * bound < error < bound * (1 + 1e5 * np.finfo(float).eps / (2 - z))
+    q, beyond = (
+        solve(systems.harmonic_oscillator(omega), method, (0.0, 201 / omega), dt=2.01 / omega).q[0],
+        2.01**2 / 2 - 1,
+    )
+    assert abs(q[-1] / q[-2]) == pytest.approx(beyond + np.sqrt(beyond**2 - 1), rel=1e-6)  # 1.2213

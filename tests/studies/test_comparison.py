@@ -9,7 +9,7 @@ import pytest
 
 from sympflow import HamiltonianSystem, SympFlow, compare, get, reference_error, solve, stability, systems
 from sympflow.metrics.reference import Reference
-from sympflow.studies.attempts import interleaved
+from sympflow.studies.attempts import Row, interleaved
 from sympflow.studies.comparison import combined_table, matched
 
 QUICK = {"n_outputs": 50, "repeats": 1}
@@ -236,6 +236,13 @@ def test_writers_name_the_path_that_they_cannot_write(tmp_path):
         assert (tmp_path / f"new_{write.__name__}" / "folder" / f"x.{ending}").is_file()
     with pytest.raises(ValueError, match=r"^`path` 'x.xyz' ends in '.xyz', which is not a format of figures"):
         study.plot(tmp_path / "x.xyz")
+
+
+def test_the_repr_of_a_row_shows_what_is_filled_in():
+    row = Row("pendulum", "verlet", "verlet", energy_error=0.0, run_time=1.5)
+    assert repr(row) == (
+        "Row(system='pendulum', method='verlet', label='verlet', status='ok', run_time=1.5, energy_error=0.0)"
+    )
 
 
 @pytest.mark.parametrize(
