@@ -60,7 +60,7 @@ STARTS = 4  # Regressions from which the search begins at most
 HIGHEST = 30  # Degree of polynomials, at most
 CORRELATED = 4  # Smoothed slopes that count as one, for their errors are correlated
 OF_A_FLOW = 5.0
-"""Factor by which the last term of a flow's Hamiltonian lowers the residual at least: a flow's errors are no noise."""
+"""Factor by which the last term of a flow's Hamiltonian lowers the residual at least: a flow's errors are not noise."""
 
 
 class Regression:
@@ -235,7 +235,8 @@ class Discovery:
     def figure(self) -> Figure:
         """The path of models: the residual over the noise against the number of terms."""
         figure = new_figure(6.4, 3.6)
-        ax, counts = figure.add_subplot(), [len(model.terms) for model in self.path]
+        ax = figure.add_subplot()
+        counts = [len(model.terms) for model in self.path]
         ax.plot(counts, [model.residual for model in self.path], "o-", color="#0072B2", label="fitted trajectories")
         held = [math.nan if model.held_out is None else model.held_out for model in self.path]
         if not np.isnan(held).any():
@@ -430,7 +431,8 @@ class _Search:
         K = len(self.library)
         if not K:
             raise ValueError("`terms` has no term that changes over the data: give others.")
-        equations, asked = data.n_values - 2 * data.ndof * n, K + len(self.superfluous)
+        equations = data.n_values - 2 * data.ndof * n
+        asked = K + len(self.superfluous)
         if equations < asked:
             raise ValueError(
                 f"`data` has {data.n_values} values, {equations} beside the initial states, and the library {asked} "
@@ -629,7 +631,8 @@ class _Search:
         significance = fit.theta**2 / np.maximum(np.diag(fit.covariance()), 1e-300)
         for weakest in np.argsort(significance)[:2]:
             rest = [k for i, k in enumerate(active) if i != weakest]
-            known, made = frozenset(rest) in self.fits, self._fit(rest, active, steps)
+            known = frozenset(rest) in self.fits
+            made = self._fit(rest, active, steps)
             promised = self._criterion(active) - self.penalty + significance[weakest]
             worse = self._criterion(rest) > promised + WORTH * self.penalty
             if known and worse and significance[weakest] < self.penalty:
@@ -740,7 +743,8 @@ class _Search:
 
     def _unseen(self, chosen: list[int], fit: Fit) -> tuple[sp.Expr, ...]:
         """Functions that are the same along all orbits: of q alone and of p alone where H is separable."""
-        d, states = self.data.ndof, np.concatenate(fit.orbits, axis=1).T
+        d = self.data.ndof
+        states = np.concatenate(fit.orbits, axis=1).T
         errors = fit.noise() * math.sqrt(fit.states.size / fit.counts.sum())
         separable = all(self.library.terms[k].kind(d) != "y" for k in chosen)
         groups = [range(d), range(d, 2 * d)] if separable else [range(2 * d)]

@@ -132,8 +132,8 @@ def learn(
     Warns
     -----
     UserWarning
-        If the residuals of the best model are no noise; with what a vector field that need not be Hamiltonian leaves of
-        them, and the likeliest reason.
+        If the residuals of the best model are not noise; with what a vector field that need not be Hamiltonian leaves
+        of them, and the likeliest reason.
 
     References
     ----------

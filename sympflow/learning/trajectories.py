@@ -149,7 +149,9 @@ class Trajectories(Shown):
             found, names = reading.of_table(data, ndof, order, time, run, q, p, velocity_mass is not None, observed)
             order = "halves"
         elif _is_a("xarray", "Dataset", data):
-            found, names, order = reading.of_dataset(data), (), "halves"
+            found = reading.of_dataset(data)
+            names = ()
+            order = "halves"
         elif isinstance(data, str | Path):
             return cls.read(reading.opened(Path(data)), ndof, **given, **converted)
         elif (
@@ -278,7 +280,7 @@ class Trajectories(Shown):
                     raise ValueError(
                         f"`trajectories` have {int(jumps.sum())} jumps of {name} by about {text}, the first in "
                         f"trajectory {at}, as of an angle that was wrapped: pass period={text}, by which it is "
-                        f"continued; or period=np.inf if {name} is no angle."
+                        f"continued; or period=np.inf if {name} is not an angle."
                     )
 
     def check_moving(self) -> None:

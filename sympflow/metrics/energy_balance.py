@@ -46,8 +46,8 @@ def energy_balance_error(sol: Solution, relative: bool = False) -> np.ndarray:
     TypeError
         If `sol` is not a Solution.
     ValueError
-        For a system with friction, whose losses are no part of the balance; for one of which H jumps in t, where it has
-        no ∂H/∂t.
+        For a system with friction, whose losses are not part of the balance; for one whose H jumps in t, where there
+        is no ∂H/∂t.
 
     References
     ----------
@@ -131,7 +131,9 @@ def _symbol(name: str, like: sympy.Symbol) -> sympy.Symbol:
 
 def _quadrature(sol: Solution) -> np.ndarray:
     """∫ ∂H/∂t dt along the executed steps, at the outputs."""
-    system, integrator, batch = sol.system, sol.integrator, to_numpy(sol.y0).shape[:-1]
+    system = sol.system
+    integrator = sol.integrator
+    batch = to_numpy(sol.y0).shape[:-1]
     direction = 1 if sol.t_span[1] >= sol.t_span[0] else -1
     work, total, done = np.zeros((len(sol.t), *batch)), np.zeros(batch), 0
     for times, states, lengths in integrator.steps(system, sol.t_span, sol.y0):

@@ -450,7 +450,8 @@ def combined_table(comparisons: Sequence[Comparison], width: int | None = None) 
 
     Where `width` characters do not hold it, there is a table for each system with the methods as columns.
     """
-    rows, several = [row for c in comparisons for row in c.rows], len(comparisons) > 1
+    rows = [row for c in comparisons for row in c.rows]
+    several = len(comparisons) > 1
     names = [c.title for c in comparisons for _ in c.rows]
     first = [i == 0 for c in comparisons for i in range(len(c.rows))]
     systems = [n if f and several else "" for n, f in zip(names, first, strict=True)]

@@ -111,7 +111,9 @@ def a_step_length_for_each_state(integrator: Integrator, system: HamiltonianSyst
 
 def what_is_not_finite_stays_so(integrator: Integrator, system: HamiltonianSystem) -> None:
     """A step from NaN is not finite, so that a blow-up is seen; other states of the batch do not notice."""
-    step, y, h = _step(integrator, system), states(system, 3), np.full(3, 0.05)
+    step = _step(integrator, system)
+    y = states(system, 3)
+    h = np.full(3, 0.05)
     alone = step(y, h)
     for bad in (np.nan, np.inf):
         spoilt = y.copy()
@@ -586,7 +588,8 @@ def the_start_time_does_not_matter(integrator: Integrator, system: HamiltonianSy
 
 def every_event_is_found(integrator: Integrator, system: HamiltonianSystem) -> None:
     """All zeros in both directions of time, by their direction, up to the count that ends the run; zeros in y too."""
-    phase, ends = (np.arange(-20, 21) * np.pi + SHIFT) / OMEGA, [T_END]
+    phase = (np.arange(-20, 21) * np.pi + SHIFT) / OMEGA
+    ends = [T_END]
     if _goes_backward(integrator, system):
         ends.append(-T_END)
     for t_end in ends:
@@ -655,10 +658,12 @@ def save_every_thins_the_outputs(integrator: Integrator, system: HamiltonianSyst
 
 def a_batch_reports_its_failures(integrator: Integrator, system: HamiltonianSystem) -> None:
     """The run of a batch, some of which blow up, has status −1 for these and 0 for the others."""
-    y0, times = np.stack([start(system), 1e150 * np.ones(2 * system.ndof)]), np.array([0.0, 8.0])
+    y0 = np.stack([start(system), 1e150 * np.ones(2 * system.ndof)])
+    times = np.array([0.0, 8.0])
     with np.errstate(all="ignore"):
         outcome = integrator.run(Problem(system, 0.0, 8.0, y0, t_eval=times))
-    finite, status = np.isfinite(np.asarray(outcome.y)).all(axis=(0, 2)), np.broadcast_to(outcome.status, (2,))
+    finite = np.isfinite(np.asarray(outcome.y)).all(axis=(0, 2))
+    status = np.broadcast_to(outcome.status, (2,))
     for i, name in ((0, "an ordinary state"), (1, "a state that may blow up")):
         wanted = 0 if finite[i] else -1
         assert status[i] == wanted, f"run() gives {name} of a batch status {status[i]}; its outputs call for {wanted}"
