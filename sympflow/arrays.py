@@ -372,7 +372,7 @@ def detached(x: Any) -> Any:
 def opaque(function: Any, *x: Array) -> Array:
     """Return a function of NumPy arrays of arrays x, or of tensors, which torch differentiates by its own rules.
 
-    It has `value(*arrays)`; `jvp(x, v)`, the derivative along v, of which entries may be None; `vjp(x, w, wanted)`,
+    It has `value(*arrays)`; `jvp(x, v)`, the derivative along v, whose entries may be None; `vjp(x, w, wanted)`,
     the derivatives of Σ w·value by those of x that are wanted.
     """
     return _opaque_function().apply(function, *x) if is_tensor(x[0]) else function.value(*x)

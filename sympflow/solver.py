@@ -39,14 +39,8 @@ from sympflow.arrays import (
 from sympflow.integrators.base import run_and_search
 from sympflow.integrators.choosing import check_tolerance, choose_method, state_error, step_for, with_start, with_step
 from sympflow.integrators.contract import Failure, Integrator, Interrupted, Outcome, Problem
-from sympflow.integrators.diagnosis import (
-    check_domain,
-    check_system_along,
-    diagnose,
-    diagnose_piece,
-    note_poles,
-    note_singularities_of_rows,
-)
+from sympflow.integrators.diagnosis import diagnose, diagnose_piece, note_poles, note_singularities_of_rows
+from sympflow.integrators.domain_exit import check_domain, check_system_along
 from sympflow.integrators.grid import MOST_OPEN_STEPS, no_event
 from sympflow.integrators.grid_runs import report_lanes
 from sympflow.integrators.impulses import landings, run_in_pieces

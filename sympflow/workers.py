@@ -105,7 +105,11 @@ def _sent(packed: bytes) -> PickledTask:
 
 
 def _pickled(value: Any) -> bytes:
-    """The pickle of an object; cloudpickle's, if that is installed, of functions that are in no module."""
+    """Return the pickle of an object.
+
+    It is cloudpickle's, if that is installed, where Python's refuses functions that are in no module, or finds some in
+    the script that runs, which the workers of an engine do not import.
+    """
     refused, data = None, b""
     try:
         data = pickle.dumps(value)
@@ -188,7 +192,35 @@ def mapped(
     processes: bool = False,
     timeout: float | None = None,
 ) -> Iterator[tuple[int, Any]]:
-    """Yield the index of each item and `function(common, item)`, in the order in which they are ready."""
+    """Yield the index of each item and `function(common, item)`, in the order in which they are ready.
+
+    Parameters
+    ----------
+    function : callable
+        Of a module, so that its name is enough to find it.
+    common : object
+        The first argument of all calls: each worker is sent it, and unpacks it once.
+    items : iterable
+    workers : int, object with .map, or callable
+        See the module's docstring.
+    processes : bool
+        True if a number of workers is one of processes, because Python code runs for long; else they are threads.
+    timeout : float, optional
+        Seconds to wait for answers in all, where they come from an `Executor`, from futures, or a number of workers.
+
+    Raises
+    ------
+    LostWorkers
+        If workers die again and again.
+    TimeoutError
+        After `timeout` seconds: what is not begun is cancelled, what is under way is not waited for.
+    TypeError
+        If the `.map` of `workers` does not return the results.
+    Unpicklable
+        If processes cannot be sent `common`.
+    Exception
+        What `function` raises, at the first item for which it does.
+    """
     workers = checked_workers(workers)
     call, left, clock = _Call(function, PickledTask(common)), dict(enumerate(items)), _Clock(timeout)
     answers = _rounds(1 if isinstance(workers, int) and len(left) < 2 else workers, call, processes, clock)
@@ -225,7 +257,15 @@ def mapped(
 
 
 class WorkerPool:
-    """Workers that stay from one map to the next, closed as a context; a number is one of processes."""
+    """Workers that stay from one map to the next, closed as a context; a number is one of processes.
+
+    Ctrl-C is left to the program that has them: it ends them.
+
+    Parameters
+    ----------
+    workers : int, object with .map, or callable
+        See the module's docstring.
+    """
 
     def __init__(self, workers: Any = 1) -> None:
         self.workers = checked_workers(workers)

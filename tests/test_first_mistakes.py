@@ -44,7 +44,7 @@ def test_a_name_and_a_formula_are_systems(system):
 )
 def test_every_door_takes_the_name_of_a_scene(call):
     call("henon-heiles")
-    with pytest.raises(ValueError, match=r"^`system` 'henon-heile' is the name of no scene. Did you mean"):
+    with pytest.raises(ValueError, match=r"^`system` 'henon-heile' is not the name of a scene. Did you mean"):
         call("henon-heile")
 
 

@@ -16,7 +16,7 @@ import typer
 from rich.console import Console
 from typer import Option
 
-from sympflow.commands.words import Scene, Usage
+from sympflow.commands.words import OF_METHODS, Scene, Usage
 from sympflow.show.cards import cut
 from sympflow.studies.reports import Column, text_table
 
@@ -57,12 +57,13 @@ PHRASES: dict[str, str | Callable[[re.Match[str]], str]] = {
     r"\[('[\w-]+'(?:, '[\w-]+')*)\]": lambda m: m[1].replace("'", "").replace(", ", ","),
 }
 """Remedies in Python, as patterns, and what they are on the command line."""
-OF_METHODS = "rtol", "atol", "max_step", "max_steps", "splitting", "clock", "shift", "compensated", "corrector"
-"""Options of methods, which are written behind the name of one."""
 
 
 def in_options(message: str, context: typer.Context) -> str:
-    """A message of the library in the options of the command: `t_span` is `--t-end`, backend='array' too."""
+    """A message of the library in the options of the command that runs: `t_span` is `--t-end`, backend='array' too.
+
+    Arguments that the command has no option for stay as they are.
+    """
     parameters = context.command.params
     named = {str(p.name): max(p.opts, key=lambda w: (w.startswith("--"), -p.opts.index(w))) for p in parameters}
     options = {name: option for name, option in named.items() if option.startswith("-")}
@@ -206,7 +207,9 @@ def tell(folder: Path, written: list[Path]) -> None:
     out.print(f"\nWritten to {folder}: {', '.join(path.name for path in written)}")
 
 
-def write_comparisons(comparisons: Any, found: list[Scene], folder: Path, say: Callable[[str], None]) -> list[Path]:
+def write_comparisons(
+    comparisons: list[Any], found: list[Scene], folder: Path, say: Callable[[str], None]
+) -> list[Path]:
     """For each system its CSV, JSON and figures; for several also one CSV and one figure of all."""
     from sympflow.show.style import save
     from sympflow.studies.figures import overview, save_comparison

@@ -30,9 +30,15 @@ def learn(
         Option("--separable/--not-separable", help="H = T(p) + V(q), or known not to be. Default: by the data."),
     ] = None,
     mass: Annotated[Text, Option(help="M of T = p²/2M, one number or d of them, as 1,2.5.")] = None,
-    known: Annotated[Text, Option(help="A part of H, as own.toml or pendulum; the rest is learned.")] = None,
-    family: Annotated[Text, Option(help="The only family, as polynomial, network or sympflow. Default: all.")] = None,
-    order: Annotated[str, Option(help="Of columns not named q1 …: halves q1 q2 p1 p2, pairs q1 p1 q2 p2.")] = "halves",
+    known: Annotated[
+        Text, Option(help="A system that is a part of H, as own.toml or pendulum; the rest is learned.")
+    ] = None,
+    family: Annotated[
+        Text, Option(help="The only family of models, as polynomial, network or sympflow. Default: all.")
+    ] = None,
+    order: Annotated[
+        str, Option(help="Of columns without the names q1 …: halves, q1 q2 p1 p2, or pairs, q1 p1 q2 p2.")
+    ] = "halves",
     observed: Annotated[
         str, Option(help="qp, states; qv, positions and velocities, of a mass that is not known; q, positions alone.")
     ] = "qp",

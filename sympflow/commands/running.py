@@ -111,7 +111,9 @@ def train(
     stages: Annotated[Count, Option(help="Kicks of a primed flow.")] = None,
     processor: Annotated[Count, Option(help="Kicks of a primed flow's processor; 0 for none.")] = None,
     pairs: Annotated[Count, Option(help="Pairs of kick and drift of a network. Default: 3.")] = None,
-    hidden: Annotated[Text, Option(help="Widths of hidden layers of a network's potentials. Default: 10,10.")] = None,
+    hidden: Annotated[
+        Text, Option(help="Widths of the hidden layers of each potential of a network. Default: 10,10.")
+    ] = None,
     activation: Annotated[Text, Option(help="Activation function of a network. Default: tanh.")] = None,
     optimizer: Annotated[
         Text,
@@ -191,7 +193,9 @@ def certificate(
     times: Annotated[int, Option(help="Times of a step in the sample.")] = 33,
     held_out: Annotated[int, Option(help="Orbits that are measured.")] = 100,
     seed: Annotated[int, Option(help="Of the sample and the orbits.")] = 0,
-    to: Annotated[File, Option("--out", help="File: .json for figures, .safetensors for the flow with them.")] = None,
+    to: Annotated[
+        File, Option("--out", help="File: .json for the figures, .safetensors for the flow with them.")
+    ] = None,
     quiet: Quiet = False,
 ) -> None:
     """Compute the certificate of a flow: what its known Hamiltonian says of its energy error.

@@ -145,7 +145,9 @@ def stability(
     own: Own = None,
     method_names: Methods = "sympflow, verlet, leapfrog, kahan_li8, implicit_midpoint, rk4, rk45",
     vary: Annotated[Text, Option(help="A parameter and its values, for a stability map: omega=1,10,100.")] = None,
-    steps: Annotated[Text, Option(help="Separated by commas. Default: from half the system's to 64 times it.")] = None,
+    steps: Annotated[
+        Text, Option(help="Steps, separated by commas. Default: from half the system's to 64 times it.")
+    ] = None,
     t_start: TStart = None,
     t_end: TEnd = None,
     y0: State = None,
@@ -203,23 +205,31 @@ def section(
         list[str] | None,
         Option("--y0", help="Initial state q,p; several times for several orbits. Default: the system's."),
     ] = None,
-    energy: Annotated[Number, Option(help="Instead: states of this energy on the plane; 16, or --orbits.")] = None,
+    energy: Annotated[
+        Number, Option(help="Instead: states of this energy on the plane, 16 or as many as --orbits.")
+    ] = None,
     orbits: Annotated[Count, Option(help="Instead: so many initial states drawn from the domain.")] = None,
     seed: Annotated[int, Option(help="Of the states that are drawn.")] = 0,
     dt: Step = None,
-    tol: Annotated[Number, Option(help="Choose the step, or a flow, with so small a relative energy error.")] = None,
-    coordinate: Annotated[Text, Option(help="The plane's constant coordinate: q1, p2. Default: the first.")] = None,
+    tol: Annotated[Number, Option(help="Choose the step, or the shipped flow, for this relative energy error.")] = None,
+    coordinate: Annotated[
+        Text, Option(help="The coordinate that is constant on the plane: q1, p2. Default: the first.")
+    ] = None,
     level: Annotated[Number, Option(help="Its value there. Default: 0.")] = None,
     direction: Annotated[
         Text, Option(help="Crossings up, down or both. Default: up.", autocompletion=completion.of(tuple(DIRECTIONS)))
     ] = None,
-    sample: Annotated[Number, Option(help="Longest time between looks at the plane. Default: the system's dt.")] = None,
+    sample: Annotated[
+        Number, Option(help="Longest time between two looks at the plane. Default: the system's step.")
+    ] = None,
     period: Annotated[
         Number, Option(help="Instead of a plane: the states after each period. Default: that of a driven system.")
     ] = None,
     since: Annotated[Number, Option(help="Leave out what is before this time.")] = None,
     axes: Annotated[Text, Option(help="Coordinates of the figure, as q2,p2. Default: the first other pair.")] = None,
-    turn: Annotated[Number, Option(help="Length of a turn of the first, such as 6.283185307 of an angle.")] = None,
+    turn: Annotated[
+        Number, Option(help="Length of a turn of the first of them, such as 6.283185307 of an angle.")
+    ] = None,
     limit: Annotated[int, Option(help="Crossings in the table; the files have all.")] = 20,
     to: Folder = None,
     quiet: Quiet = False,

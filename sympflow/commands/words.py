@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial, wraps
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, overload
 
 import numpy as np
 import typer
@@ -120,7 +120,20 @@ def made(scene: str, **params: Any) -> HamiltonianSystem:
 
 @dataclass(frozen=True)
 class Scene:
-    """A system as asked for; its key names its files."""
+    """A system as asked for.
+
+    Attributes
+    ----------
+    key : str
+        Names its files.
+    system : HamiltonianSystem
+    t_end : float or None
+        Where it should end, if that was said.
+    factory : callable
+        Makes the system of other parameters.
+    params : dict
+        The parameters that were said.
+    """
 
     key: str
     system: HamiltonianSystem
@@ -139,7 +152,16 @@ def _defaults(factory: Callable[..., HamiltonianSystem]) -> dict[str, Any]:
 
 
 def scenes(words: Sequence[str] | None, own: Sequence[str] | None = None) -> list[Scene]:
-    """Scenes from words such as ``henon-heiles``, ``harmonic-oscillator:omega=10`` and ``--omega 100``."""
+    """Scenes from words such as ``henon-heiles``, ``harmonic-oscillator:omega=10:t_end=5`` and ``--omega 100``.
+
+    A parameter behind two dashes holds for every scene that has it. A scene may be one of a file: ``file.toml``,
+    ``file.py:name``. `own` are more of them.
+
+    Raises
+    ------
+    ValueError
+        For a scene or a parameter that does not exist.
+    """
     names, shared = _split(words or ())
     names += own or ()
     if not names:
@@ -150,8 +172,8 @@ def scenes(words: Sequence[str] | None, own: Sequence[str] | None = None) -> lis
         for name in shared:
             if name not in known:
                 if name in ("param", "params", "parameter", "parameters") and "=" in shared[name]:
-                    raise Usage(f"`--{name}` is no option: write --{' '.join(shared[name].split('=', 1))}.")
-                if name in OF_METHODS:
+                    raise Usage(f"`--{name}` is not an option: write --{' '.join(shared[name].split('=', 1))}.")
+                if name in (*OF_METHODS, "flow"):
                     given = f"{name}={shared[name]}"
                     raise Usage(
                         f"`--{name}` is an option of some methods: give it behind the name, --method NAME:{given}."
@@ -165,7 +187,7 @@ def scenes(words: Sequence[str] | None, own: Sequence[str] | None = None) -> lis
                     + (f"did you mean --{meant}?" if meant else "see --help.")
                 )
         return _told_apart([_scene(name, factory, pairs, shared) for name, factory, pairs in parted])
-    except (ValueError, TypeError) as error:  # of what the system is made of, which is no option of the command
+    except (ValueError, TypeError) as error:  # of what the system is made of, not of an option of the command
         raise Usage(str(error)) from error
 
 
@@ -231,7 +253,19 @@ MEANT = {  # options by the names that users try
     **dict.fromkeys(("q0", "p0", "x0", "q", "p", "initial", "ic"), "y0"),
     **dict.fromkeys(("output", "save", "plot", "file", "csv", "o"), "out"),
 }
-OF_METHODS = ("rtol", "atol", "max_step", "first_step", "compensated", "corrector", "splitting", "clock", "flow")
+OF_METHODS = (
+    "rtol",
+    "atol",
+    "max_step",
+    "max_steps",
+    "first_step",
+    "splitting",
+    "clock",
+    "shift",
+    "compensated",
+    "corrector",
+)
+"""Options of methods, which are written behind the name of one."""
 FORMULA = re.compile(r"\*|[²³]|(?<![A-Za-z])[qp]\d*\s*[-+/^]")  # a word that is H, and not the name of a scene
 
 
@@ -389,8 +423,16 @@ def _pairs(words: Sequence[str]) -> list[tuple[str, str]]:
     return list(found.items())
 
 
-def state(words: str | None) -> Any:
-    """A state from ``0.3,-0.3,0.3,0.15``, an array; None without any words."""
+@overload
+def state(words: str) -> np.ndarray: ...
+
+
+@overload
+def state(words: None) -> None: ...
+
+
+def state(words: str | None) -> np.ndarray | None:
+    """A state from ``0.3,-0.3,0.3,0.15``; None without any words."""
     if words is None:
         return None
     return np.array([_float("--y0", word) for word in re.split(r"\s*[,\s]\s*", words.strip("[]() "))])

@@ -711,7 +711,12 @@ def _linear_layer(x: Any, weight: Any, bias: Any = None) -> np.ndarray | None:
 
 
 class Chain(NamedTuple):
-    """A function of x (n,): layers (weight, bias), a program of one number between two, others before and behind."""
+    """A function of x (n,): linear layers one after the other, with a function of each number between two of them.
+
+    `first` goes from x to the input of the first layer, each of `between` from one number to one, behind each layer but
+    the last, and `last` from x and the output of the last layer to the value. `layers` are pairs of a weight (to, from)
+    and a bias (to,), or None.
+    """
 
     first: Program
     between: list[Program]
@@ -754,7 +759,10 @@ def _check_inputs(program: Program, inputs: Sequence[Traced]) -> None:
 
 
 def trace(function: Callable[..., Any], names: Sequence[Sequence[str] | str], torch: bool = False) -> Program:
-    """Record a function of arrays, or of tensors, that returns one number; `names` are those of the elements."""
+    """Record a function of arrays, or of tensors (`torch`), which returns one number; `Untraceable` says why not.
+
+    `names` has, for each argument, the names of the elements of an array, or the name of a number.
+    """
     inputs, value = _recorded(_Recorded(), function, names, torch)
     return Program(inputs, [value])
 

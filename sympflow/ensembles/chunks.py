@@ -97,7 +97,10 @@ class Chunk:
         return Grid(*self.t_span, length).outputs(None, 1)
 
     def windows(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """The states along the orbits, in bounded memory: times (m,) and states (n, 2d, m), window by window."""
+        """The states along the orbits, in bounded memory: times (m,) and states (n, 2d, m), one window after another.
+
+        States of an orbit from where it failed are NaN.
+        """
         times, stepper = self.times, self._stepper
         most, alike = max(1, MOST_VALUES // self.y0.size), self.t_eval is None and not self.params
         kernel = None if stepper is None else stepper.kernel

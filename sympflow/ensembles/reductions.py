@@ -100,7 +100,10 @@ class Final(Reduction):
 
 @dataclass(frozen=True)
 class EnergyError(Reduction):
-    """The largest error |H(y(t)) − H(y0)| along each orbit over its `energy_scale`, if there is one: `energy_error`."""
+    """The largest relative energy error |H(y(t)) − H(y0)| / |H(y0)| along each orbit: `energy_error`.
+
+    It is relative to the `energy_scale` of `sympflow.metrics.energy`, and absolute where that is missing.
+    """
 
     def check(self, system: HamiltonianSystem) -> None:
         system.check_conservative("so its energy is lost and no error", "use another `reduce`, such as 'final'")
@@ -126,7 +129,11 @@ class EnergyError(Reduction):
 
 @dataclass(frozen=True)
 class OfFunction(Reduction):
-    """A user's function of (t (m,), y (2d, m)) of one orbit: a number, an array, or a dict of such, as of the first."""
+    """A user's function of (t (m,), y (2d, m)) of one orbit, which returns a number, an array, or a dict of such.
+
+    The shapes are those of the first orbit, and numbers are complex if its are. An orbit for which the function raises,
+    or returns another shape, or imaginary parts where the first has none, has failed, with that message.
+    """
 
     function: Callable[[np.ndarray, np.ndarray], Any]
     found: Fields = field(default_factory=dict, compare=False)
@@ -151,7 +158,9 @@ class OfFunction(Reduction):
             except ValueError as error:
                 raise ValueError(f"`reduce` cannot be kept: {error}") from None
             return dict(self.found)
-        raise ValueError(f"`reduce` cannot be tried: the first {len(problem)} orbits fail. Reduce `dt`, or mend `y0`.")
+        raise ValueError(
+            f"`reduce` cannot be tried: the first {len(problem)} orbits all fail. Reduce `dt`, or mend `y0`."
+        )
 
     def reduce(self, chunk: Chunk) -> dict[str, np.ndarray]:
         out = {name: np.full((len(chunk), *shape), np.nan, dtype) for name, (shape, dtype) in self.found.items()}
@@ -195,9 +204,13 @@ def _arrays(value: Any) -> dict[str, np.ndarray]:
             array = np.empty(0, dtype=object)
         whole = array.dtype.kind in "iu" or (array.dtype == object and all(isinstance(x, int) for x in array.flat))
         if whole and array.size and max(-int(array.min()), int(array.max())) > EXACT:
-            raise ValueError(f"{name} has an integer beyond 2**53, which floats change: return its parts, or a float")
+            raise ValueError(
+                f"{name} has an integer beyond 2**53, which floats would change: return its parts, or a float"
+            )
         if array.dtype.kind not in "biufc" or not isinstance(name, str):
-            raise TypeError(f"`reduce` must return numbers, an array, or a dict of such; got {type(v).__name__}.")
+            raise TypeError(
+                f"`reduce` must return numbers, an array of them, or a dict of such by name; got {type(v).__name__}."
+            )
         arrays[name] = array.astype(complex if array.dtype.kind == "c" else float)
     return arrays
 

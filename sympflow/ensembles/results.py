@@ -94,7 +94,10 @@ class Variable:
 
 @dataclass(frozen=True)
 class Layout:
-    """The axes of an ensemble, `n` orbits at each of their values, and the fields that are kept of each orbit."""
+    """The axes of an ensemble, `n` orbits at each of their values, and the fields that are kept of each orbit.
+
+    `state` is the field that holds states [q, p] along its first axis; "" if there is none.
+    """
 
     axes: dict[str, np.ndarray]
     n: int
@@ -169,9 +172,15 @@ class Keeper(Protocol):
     def status(self) -> np.ndarray: ...
     @property
     def messages(self) -> Mapping[Index, str]: ...
-    def place(self, block: Block, done: Done) -> None: ...
-    def finish(self) -> None: ...
-    def is_done(self, block: Block) -> bool: ...
+    def place(self, block: Block, done: Done) -> None:
+        """Put the orbits of a block where they belong."""
+
+    def finish(self) -> None:
+        """Note that all orbits are there."""
+
+    def is_done(self, block: Block) -> bool:
+        """True if the orbits of a block are there already."""
+
     def dataset(self) -> xarray.Dataset: ...
 
 

@@ -198,7 +198,9 @@ def ensemble(
     return Ensemble(layout.times, axes, system, integrator, (t0, t1), orbits, keeper, seconds)
 
 
-def _axes(system: HamiltonianSystem, params: Any) -> tuple[dict[str, float], dict[str, np.ndarray]]:
+def _axes(
+    system: HamiltonianSystem, params: Mapping[str, ArrayLike] | None
+) -> tuple[dict[str, float], dict[str, np.ndarray]]:
     """The parameters that are numbers, and those that are axes."""
     if params is None:
         return {}, {}
@@ -211,7 +213,9 @@ def _axes(system: HamiltonianSystem, params: Any) -> tuple[dict[str, float], dic
         values = floats("params", given)
         if not np.isfinite(values).all():
             where = int(np.flatnonzero(~np.isfinite(np.ravel(values)))[0])
-            raise ValueError(f"`params` has {name} = {np.ravel(values)[where]} at {where}: give finite ones.")
+            raise ValueError(
+                f"`params` has {name} = {np.ravel(values)[where]} at {where}: give finite numbers, or leave it out."
+            )
         if values.ndim > 1 or values.size == 0:
             raise ValueError(
                 f"`params` must give {name!r} a number, or a list of them; got shape {values.shape}. For "
@@ -249,7 +253,11 @@ def _runs_together(
     y0: np.ndarray,
     backend: str,
 ) -> bool:
-    """True if one compiled run takes orbits with different parameters; else each value has runs of its own."""
+    """True if one compiled run takes orbits with different parameters; else each value has runs of its own.
+
+    It does not depend on the chunk, so that each orbit is run alike in any of them: a value that leaves its part of H
+    as it is, other than 0, 1 and −1, tells for all.
+    """
     from sympflow.hamiltonian.parameter_rows import ParameterRows
 
     if not axes or system.symbols is None:

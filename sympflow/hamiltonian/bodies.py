@@ -43,7 +43,15 @@ class PairsHamiltonian(LocalHamiltonian):
     quadratic_kinetic = True
 
     def __init__(
-        self, potential: Any, masses: Any, dim: Any, box: Any, cutoff: Any, softening: Any, params: Any, bodies: Any
+        self,
+        potential: str | sp.Expr,
+        masses: Any,
+        dim: Any,
+        box: Any,
+        cutoff: Any,
+        softening: Any,
+        params: Mapping[str, Any] | None,
+        bodies: Mapping[str, Any] | None,
     ) -> None:
         self.dim = checked_count("dim", plain(dim), 1, MOST_AXES, "1, 2 or 3, the coordinates of a body")
         self.masses = checked_column("masses", masses)
@@ -173,7 +181,12 @@ class PairsHamiltonian(LocalHamiltonian):
         return SymbolicHamiltonian(T + V, {f"{name}_": value for name, value in self.params.items()})
 
     def written_potential(
-        self, q: Sequence[Any], softening: Any, columns: Sequence[Any], c: Mapping[Any, Any], box: Sequence[Any] = ()
+        self,
+        q: Sequence[sp.Expr],
+        softening: sp.Expr,
+        columns: Sequence[Sequence[sp.Expr]],
+        c: Mapping[sp.Symbol, sp.Expr],
+        box: Sequence[sp.Expr] = (),
     ) -> sp.Expr:
         """V of all pairs, in symbols of positions, ε², columns of bodies, parameters and the sides of the box."""
         terms = []
@@ -317,7 +330,7 @@ class PairsHamiltonian(LocalHamiltonian):
             values = self._values(f"potential {key}", lambda: expressions, names, distances, *symbol_values)
         return [np.broadcast_to(value, distances.shape) for value in values]
 
-    def leapt(self, starts: np.ndarray, ends: np.ndarray, n_steps: Any, conserves: bool) -> np.ndarray:
+    def leapt(self, starts: np.ndarray, ends: np.ndarray, n_steps: int | np.ndarray, conserves: bool) -> np.ndarray:
         """By an energy that is off by more than T + |V| of the start, and a T of more than twice that."""
         pairs = self.n_bodies * (self.n_bodies - 1) // 2
         T0, T = np.square(np.array([starts, ends])[..., self.ndof :]) @ np.repeat(0.5 / self.inertia, self.dim)

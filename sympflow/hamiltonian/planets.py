@@ -407,7 +407,12 @@ class PlanetsHamiltonian(PairsHamiltonian):
         return "" if self.extra is None or few else "an `extra` potential of many bodies"
 
     def written_potential(
-        self, q: Sequence[Any], softening: Any, columns: Sequence[Any], c: Mapping[Any, Any], box: Sequence[Any] = ()
+        self,
+        q: Sequence[sp.Expr],
+        softening: sp.Expr,
+        columns: Sequence[Sequence[sp.Expr]],
+        c: Mapping[sp.Symbol, sp.Expr],
+        box: Sequence[sp.Expr] = (),
     ) -> sp.Expr:
         V = super().written_potential(q, softening, columns, c, box)
         if self.extra is None:

@@ -641,12 +641,12 @@ class KeplerInteraction(Composition):
 
     def doubt(self, dt: float) -> str:
         frame, crossing = self.frame, self.frame.crossing()
-        if dt > 2 * self.longest_step() * (1 + 1e-9):
+        if dt > self.longest_step() * (1 + 1e-9):
             body = 1 + int(np.argmin(frame.periods))
             return (
-                f"`dt` {dt:g} is long for method {self.method!r}: its kicks are more than a tenth of the period of "
+                f"`dt` {dt:g} is long for method {self.method!r}: its kicks are more than a twentieth of the period of "
                 f"body {body}, {frame.periods.min():.4g}, apart, where steps may be in resonance with the orbit. Take "
-                f"at most {2 * self.longest_step():.3g}: {self.longest_step():.3g} is the default."
+                f"at most {self.longest_step():.3g}."
             )
         if crossing:
             return (

@@ -34,7 +34,27 @@ _COMPARED: WeakKeyDictionary[HamiltonianSystem, dict[int, tuple[ref[Any], np.nda
 
 
 class Comparison:
-    """Compares a right-hand side that a peer was given with the velocity of the motion that a method computes."""
+    """Compares the right-hand side that a peer was given with the velocity of the motion that a method computes.
+
+    That is J∇H of the system; of a flow that was given without one, ∂_tψ̄ at t = 0.
+
+    Parameters
+    ----------
+    argument : str
+        The peer's name of its right-hand side.
+    integrator : FixedStep
+    system : HamiltonianSystem or None
+        None for a flow that was given without a system.
+    remedy : str
+        The way to pass the same system twice.
+
+    Attributes
+    ----------
+    states_compared : int
+        States at which the method's own velocity was evaluated so far.
+    known : bool
+        True if an earlier run compared this very right-hand side, so that its start and end are enough.
+    """
 
     def __init__(self, argument: str, integrator: FixedStep, system: HamiltonianSystem | None, remedy: str) -> None:
         self.argument, self.integrator, self.system, self.remedy = argument, integrator, system, remedy
@@ -55,15 +75,31 @@ class Comparison:
             )
 
     def with_flow(self, y: np.ndarray, t: float) -> None:
-        """Raise a ValueError if a flow that knows no system does not move y (2d,) as the system it shall solve."""
+        """Compare the velocity of a flow that knows no system with that of the system it shall solve.
+
+        Raises
+        ------
+        ValueError
+            If they differ at y (2d,) or in the domain of the flow; of a driven system at the time t.
+        """
         if self.flow is None or self.system is None or self.flow.fingerprint is not None:
             return
         states = np.concatenate([y[None], _drawn(self.flow.domain_for(self.system), y.size)])
         times = np.full(len(states), t)
         self._close_to_flow(times, states, self.system.vector_field(states, times))
 
-    def at_start(self, fun: RightHandSide, y0: np.ndarray, t_span: tuple[float, float], given: Any = None) -> None:
-        """Compare at y0 (..., 2d), at states around it, and in the domain; at y0 alone if `given` is remembered."""
+    def at_start(
+        self, fun: RightHandSide, y0: np.ndarray, t_span: tuple[float, float], given: Callable[..., Any] | None = None
+    ) -> None:
+        """Compare at several states and times: y0 (..., 2d), states around it, and states of the domain.
+
+        At y0 alone, if `given`, the function of the user, is remembered from a run with such states and times.
+
+        Raises
+        ------
+        ValueError
+            If the right-hand side is another system's, or depends on the time.
+        """
         t0 = t_span[0]
         self.at(t0, y0, fun(t0, y0), fun)
         self.known = self._remembers(given, _bounds(t_span, [y0]))
@@ -112,7 +148,10 @@ class Comparison:
         return bool((known[0] <= bounds[0]).all() and (known[1] >= bounds[1]).all())
 
     def _probes(self, y0: np.ndarray) -> list[np.ndarray]:
-        """States like y0 (..., 2d): its rows moved to each distance, and to each state of the domain, in turn."""
+        """States like y0 (..., 2d): each of its rows moves to each distance, and to each state of the domain, in turn.
+
+        As few of them as a batch has rows enough, but three at least.
+        """
         rows = y0.reshape(-1, y0.shape[-1])
         d = rows.shape[-1] // 2
         size = np.repeat([np.abs(rows[:, part]).max() or 1.0 for part in (slice(0, d), slice(d, None))], d)
@@ -151,7 +190,13 @@ class Comparison:
         return True
 
     def at(self, t: Any, y: np.ndarray, slope: Any, fun: RightHandSide, t0: float | None = None) -> None:
-        """Compare at states y (..., 2d) of the run, where `fun` gives `slope`; a ValueError if they differ."""
+        """Compare at states y (..., 2d) of the run, where `fun` gives `slope`, at a time or a time for each.
+
+        Raises
+        ------
+        ValueError
+            If the right-hand side is another system's, or, where t0 is given, depends on the time.
+        """
         width = y.shape[-1]
         states, slope = y.reshape(-1, width)[:MOST_ROWS], np.asarray(slope).reshape(-1, width)[:MOST_ROWS]
         times = np.broadcast_to(t, y.shape[:-1]).reshape(-1)

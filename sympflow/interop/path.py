@@ -33,7 +33,20 @@ def numbers(t: Tensor) -> np.ndarray:
 
 
 class Path:
-    """The trajectory of an integrator from y0 (..., 2d), on the grid k·dt of elapsed times, in one direction."""
+    """The trajectory of an integrator from y0, on the grid k·dt of elapsed times, in one direction of time.
+
+    Parameters
+    ----------
+    integrator : FixedStep
+    system : HamiltonianSystem or None
+        None for a flow that needs none.
+    y0 : tensor of shape (..., 2d)
+    direction : 1 or -1
+    t0 : tensor of shape ()
+        The time of y0, on which the steps of a driven system depend.
+    before_step : callable, optional
+        Called before each step, which are then made one by one.
+    """
 
     def __init__(
         self,
@@ -54,7 +67,10 @@ class Path:
         self.eager = learns or differentiable(*self.weights(), self.t0)
 
     def __call__(self, s: Tensor) -> Tensor:
-        """ψ_s(y0), (n, ..., 2d), for elapsed times s (n,), each 0 or with the sign of the direction."""
+        """ψ_s(y0), (n, ..., 2d), for elapsed times s (n,), each 0 or with the sign of the direction.
+
+        Differentiable in s (where an s is a whole number of steps: in the step that begins or ends there).
+        """
         count, r = self.located(s)
         saved = np.unique(numbers(count))
         states = self.rollout(saved)[_places(saved, count)]
@@ -69,7 +85,11 @@ class Path:
         return _each(self.t0 + count.to(torch.float64) * self.h, states) if self.driven else 0.0
 
     def located(self, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Counts k of whole steps and remainders r (n,), with s = k·h + r; gradients flow from s to r."""
+        """Counts k of whole steps and remainders r (n,), in float64, with s = k·h + r; gradients flow from s to r.
+
+        As `Grid.locate`: a quotient within a few ulp of an integer is that integer. Under `torch.func.vmap` each lane
+        has its own.
+        """
         elapsed = numbers(s)
         far = float(np.abs(elapsed).max(initial=0.0))
         if self.driven:
@@ -89,7 +109,10 @@ class Path:
         return count.to(torch.int64), torch.where(on_grid, r - r.detach(), r)
 
     def rollout(self, save: np.ndarray, start: Tensor | None = None, first: int = 0) -> Tensor:
-        """The states after the steps `save` (sorted counts) from y0, or from `start`, the state after `first` steps."""
+        """The states after the steps `save` (sorted counts): compiled if torch follows nothing.
+
+        From y0, or from `start`, the state after `first` steps.
+        """
         y: Any = self.y0 if start is None else start
         if self.before_step is not None:
             return self._one_by_one(save)
@@ -117,7 +140,10 @@ class Path:
         return torch.stack(states)
 
     def step(self, y: Tensor, h: float | Tensor, t: Any) -> Tensor:
-        """A step of length h from t, each a number or one for each state; by NumPy where nothing is differentiated."""
+        """A step of length h from the time t, each a number or one for each state.
+
+        By NumPy where nothing is to be differentiated. The time is 0 where the system does not depend on it.
+        """
         return self._stepped(self.integrator.step, y, h, t)
 
     def inverse(self, y: Tensor, t: Any) -> Tensor:
@@ -142,7 +168,19 @@ class Path:
         return [] if flow is None else list(flow.parameters())
 
     def first_zero(self, g: Callable[[Tensor, Tensor], Tensor]) -> tuple[Tensor, Tensor]:
-        """The elapsed time s at which g(s, ψ_s(y0)), a number, first vanishes, and the state there; differentiable."""
+        """The elapsed time s at which g(s, ψ_s(y0)), a number, first vanishes, and the state there.
+
+        g is tested at every step, and every `system.dt` within longer ones, such as those of a flow.
+
+        Their derivatives are those of the implicit function g(s, ψ_s) = 0, in both modes, the first and the second.
+
+        Raises
+        ------
+        RuntimeError
+            If there is none within a million steps, or the state became non-finite before.
+        TypeError
+            If the values of the states are hidden, by `torch.func.vmap` or `torch.compile`.
+        """
         if not readable(self.y0) or (self.eager and not readable(self.step(self.y0, self.h, self.t0))):
             raise TypeError(
                 "`event_fn` is followed by the values of the states, which torch.func.vmap and torch.compile hide: "
@@ -236,9 +274,19 @@ class Path:
 
 
 class DensePath(Path):
-    """A path between two `times` (2,) whose states on the grid are computed once."""
+    """A path to a known end whose states on the grid are computed once.
 
-    def __init__(self, integrator: FixedStep, system: Any, y0: Tensor, direction: int, times: Tensor) -> None:
+    Parameters
+    ----------
+    integrator, system, y0, direction
+        As for `Path`.
+    times : tensor of shape (2,)
+        Its beginning and end.
+    """
+
+    def __init__(
+        self, integrator: FixedStep, system: HamiltonianSystem | None, y0: Tensor, direction: int, times: Tensor
+    ) -> None:
         super().__init__(integrator, system, y0, direction, times[0])
         count, _ = self.located(times[1:] - times[0])
         self.span = numbers(times)
@@ -247,7 +295,9 @@ class DensePath(Path):
     def __call__(self, s: Tensor) -> Tensor:
         found, length, slack = numbers(s), self.span[1] - self.span[0], _EPS * np.abs(self.span).max()
         if found.size and not (found.min() >= min(0.0, length) - slack and found.max() <= max(0.0, length) + slack):
-            raise ValueError(f"`t` must lie between {self.span[0]:g} and {self.span[1]:g}, the interval solved.")
+            raise ValueError(
+                f"`t` must lie between {self.span[0]:g} and {self.span[1]:g}, the interval that was solved."
+            )
         return super().__call__(s)
 
     def rollout(self, save: np.ndarray, start: Tensor | None = None, first: int = 0) -> Tensor:
@@ -255,7 +305,21 @@ class DensePath(Path):
 
 
 class AdjointPath(Path):
-    """A path whose derivatives are pulled back step by step, along states that the inverse of the map steps to."""
+    """A path whose derivatives are pulled back step by step, along the states that the inverse of the map steps to.
+
+    Memory does not grow with the number of steps: only the states at the outputs are kept. They are those of
+    backpropagation to the rounding of the inverse, which an unstable orbit magnifies from output to output. A map
+    without an inverse is run again from its outputs, with √n states kept of n steps between two of them.
+
+    Reverse mode only, and once.
+
+    Parameters
+    ----------
+    integrator, system, y0, direction, before_step
+        As for `Path`.
+    parameters : sequence of tensors
+        Numbers of H that get gradients, beside the weights of a flow.
+    """
 
     def __init__(self, *arguments: Any, parameters: Sequence[Tensor] = (), **more: Any) -> None:
         super().__init__(*arguments, **more)
@@ -294,7 +358,10 @@ class AdjointPath(Path):
                     yield first + mark + j, state
 
     def pulled(self, y: Tensor, h: float | Tensor, t: Any, a: Tensor) -> tuple[Tensor, list[Any], list[Any]]:
-        """The cotangents of y, of h and t, and of the parameters in a step, where that of its end is a."""
+        """The cotangents of y, of h and t, and of the parameters in a step from y at t, where that of its end is a.
+
+        None for an h or t without a graph.
+        """
         with torch.enable_grad(), naming_plugin(self.integrator):
             y = y.detach().requires_grad_(True)
             inputs: list[Any] = [y, *self.parameters]

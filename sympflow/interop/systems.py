@@ -149,7 +149,9 @@ def from_module(module: Callable[[Any, Tensor], Tensor], ndof: int, **scene: Any
     return _guarded(system, "module", minus_J_f, probes)
 
 
-def _guarded(system: HamiltonianSystem, argument: str, gradient: Any, probes: Tensor) -> HamiltonianSystem:
+def _guarded(
+    system: HamiltonianSystem, argument: str, gradient: Callable[[Tensor], Tensor], probes: Tensor
+) -> HamiltonianSystem:
     """The system, which compares M⁻¹p with ∂H/∂p at one state whenever it is used."""
     d, state = system.ndof, probes[:1]
     expected = system.velocity(state[:, d:])
@@ -193,7 +195,10 @@ def _probes(ndof: int, y0: ArrayLike | None) -> Tensor:
 
 
 def _mass(hessian: Tensor, gradient: Callable[[Tensor], Tensor], probes: Tensor) -> np.ndarray | None:
-    """M if H is ½ pᵀM⁻¹p + V(q) at all probes, judged by what does not depend on the units of q, p and H."""
+    """M if H is ½ pᵀM⁻¹p + V(q) at all probes, judged by what does not depend on the units of q, p and H.
+
+    Entry (i, j) of ∂²H is small if it is small beside √(∂²H/∂y_i² · ∂²H/∂y_j²), the only product of such units.
+    """
     d, A = probes.shape[-1] // 2, hessian.detach().numpy()
     size, K = _size(A), A[:, d:, d:]
     units = size[d:, d:]
@@ -231,11 +236,12 @@ def _trained(values: Tensor) -> bool:
 def leaves(values: Tensor) -> list[Tensor]:
     """The leaves of the graph on which values depend, such as a network's weights."""
     found: list[Tensor] = []
-    waiting, met = [values.grad_fn], set()
+    waiting: list[Any] = [values.grad_fn]
+    met: set[Any] = set()
     while waiting:
         if (node := waiting.pop()) is not None and node not in met:
             met.add(node)
-            found += [node.variable] if hasattr(node, "variable") else []
+            found += [node.variable] if node.name().endswith("AccumulateGrad") else []
             waiting += [parent for parent, _ in node.next_functions]
     return found
 

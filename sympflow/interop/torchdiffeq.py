@@ -334,7 +334,9 @@ def _is_ours(method: Any, func: Any, options: Any) -> bool:
     return bool(ours) or found is None or issubclass(found, _Solver)
 
 
-def _landing(func: Any, t: Any, method: Any, options: Any, endless: bool = False) -> dict[str, Any] | None:
+def _landing(
+    func: Any, t: Any, method: Any, options: dict[str, Any] | None, endless: bool = False
+) -> dict[str, Any] | None:
     """Options with which a method of torchdiffeq ends steps where a HamiltonianSystem jumps in t."""
     known, name = dict(options or {}), method or "dopri5"
     if not isinstance(func, HamiltonianSystem) or func.autonomous or not isinstance(t, Tensor) or not t.numel():
@@ -420,7 +422,9 @@ def _direction(t: Any) -> int:
     return -1 if steps.size and steps.flat[0] < 0 else 1
 
 
-def _announced(func: Any, y0: Tensor, t: Tensor, pack: Any, integrator: FixedStep) -> BeforeStep | None:
+def _announced(
+    func: Any, y0: Tensor, t: Tensor, pack: Callable[[Tensor], Any], integrator: FixedStep
+) -> BeforeStep | None:
     """torchdiffeq's `callback_step`, if `func` has it: called before each step with its time, state and length."""
     others = {name for name in _CALLBACKS if getattr(func, name, None) is not None}
     if others:
@@ -464,7 +468,9 @@ def _check_state(y: Tensor, system: HamiltonianSystem | None, integrator: Integr
 class _Compared:
     """Compares `func`, where it is not the system itself, with what the method solves: see `matching.Comparison`."""
 
-    def __init__(self, func: Any, y0: State, t: Any, integrator: FixedStep, system: HamiltonianSystem | None) -> None:
+    def __init__(
+        self, func: Any, y0: State, t: Tensor, integrator: FixedStep, system: HamiltonianSystem | None
+    ) -> None:
         flow = integrator.given_flow
         self.comparison = comparison = Comparison("func", integrator, system, _REMEDY)
         y, self.pack = _joined(y0)

@@ -117,13 +117,24 @@ class SymplecticStep(SingleStepMethod):
     def init(self, term: Any, problem: Any, f0: Tensor | None, *, stats: dict[str, Any], args: Any) -> Run:
         """The state of the method: its run."""
         if problem.n_features != 2 * self.system.ndof:
-            raise ValueError(f"`y0` must have shape (batch, {2 * self.system.ndof}), [q, p]; got {problem.n_features}.")
+            raise ValueError(
+                f"`y0` must have shape (batch, {2 * self.system.ndof}), [q, p]; got {problem.n_features} features."
+            )
         times = to_numpy(torch.stack([problem.t_start, problem.t_end]).detach())
         self.system.check_times(times.min(), times.max())
         return Run(term, problem, self, stats, args)
 
     def step(
-        self, term: Any, running: Any, y0: Tensor, t0: Tensor, dt: Tensor, state: Run, *, stats: Any, args: Any
+        self,
+        term: Any,
+        running: Tensor,
+        y0: Tensor,
+        t0: Tensor,
+        dt: Tensor,
+        state: Run,
+        *,
+        stats: dict[str, Any],
+        args: Any,
     ) -> tuple[StepResult, Beginning, Run, None]:
         left = state.ends - t0.detach()
         # torchode cuts a step away from the end to one of length 0, and would go on for ever

@@ -578,7 +578,10 @@ def kepler_loops(frame: Frame) -> KeplerLoops:
 
 
 class KeplerKernel(Kernel):
-    """The compiled loops of a scheme of kicks by the interaction and Kepler's drifts, with a processor or none."""
+    """The compiled loops of a scheme of kicks by the interaction and Kepler's drifts, with or without a processor.
+
+    `before` and `after` are the processor and its inverse; empty for none.
+    """
 
     def __init__(
         self,

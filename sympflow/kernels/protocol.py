@@ -22,7 +22,8 @@ NOTHING: Any = np.empty(0)
 class RunCheckpoint:
     """The place where a run is cut: with it, pieces of a run give the same bits as the run in one piece.
 
-    Consecutive steps share a kick or a drift, and compensated sums have errors, so that the running state is no output.
+    The states that a run saves are not enough for that: consecutive steps share a kick or a drift, so that the running
+    state is another one, and compensated sums have errors.
     A run goes on from a carry and leaves its end there; one that is interrupted leaves it as it was. `steps` are those
     made so far, `running` (K,), or (N, K) of a batch, the kernel's own: None before a run, NaN where a trajectory has
     ended. The next running state of a batch may be written into `spare`.

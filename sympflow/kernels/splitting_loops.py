@@ -114,7 +114,7 @@ class SplittingLoops:
             if system.damping is not None and system.damping.ndim:
                 raise arrays_only(f"`system` {system.name!r} has friction, and its loops take one rate for all momenta")
             if local.arrays_only:
-                raise NotCompiled(f"`system` has {local.arrays_only}, whose kicks are array operations: use 'array'.")
+                raise arrays_only(f"`system` has {local.arrays_only}, whose kicks are array operations")
             if local.loops == "pairs":
                 from sympflow.kernels.pairs import PairCode, few
 

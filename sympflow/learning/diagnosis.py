@@ -16,7 +16,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -73,7 +73,10 @@ MOST_DRIVES, SWEEPS = 2, 2
 
 
 class Cause(Enum):
-    """Reasons why no H(q, p) explains data, in words and with advice, the plainest first."""
+    """Reasons why no H(q, p) explains data, each in words and with advice that has a place for the factors of forces.
+
+    The plainest come first.
+    """
 
     FRICTION = (
         "the best H with friction p' = -γp",
@@ -130,8 +133,9 @@ class Reading:
 
     def test(self, theta: np.ndarray, states: np.ndarray, scales: np.ndarray) -> tuple[float, float]:
         """LᵀJ + JL over twice JL, 0 for any H, at states (2d, n) in the order of the reading; the rate of volumes."""
-        slopes, back = self.field.field(theta, states, True, False).slope, np.argsort(self.rows)
-        slopes, d = slopes[np.ix_(back, back)], len(scales) // 2
+        back = np.argsort(self.rows)
+        slopes = self.field.field(theta, states, True, False).slope[np.ix_(back, back)]
+        d = len(scales) // 2
         ratio = np.sqrt(scales[:d] / scales[d:])
         units = np.concatenate([ratio, 1 / ratio])  # in which dq∧dp remains as it is
         L = slopes * (units / units[:, None])[..., None]
@@ -141,7 +145,10 @@ class Reading:
 
 
 def forced(model: Model, drives: Sequence[Drive] = ()) -> list[Reading]:
-    """The model with forces that no H(q, p) gives, from plain to rich; of one that has a force only with a drive."""
+    """The model with forces that no H(q, p) gives: friction, what turns p, quadratic drag, drives; from plain to rich.
+
+    Of a model that has a force only a drive is of interest.
+    """
     rows = tuple(range(2 * model.ndof))
     forces = [(frictions, Cause.FRICTION), (turns, Cause.TURNED), (drags, Cause.DRAG)]
     made = []
@@ -164,7 +171,10 @@ def free_reading(scales: np.ndarray, degree: int) -> Reading:
 def best_by_increments(
     data: Trajectories, held: Trajectories, models: Sequence[Model], drives: Sequence[Drive] = (), stop: Stop = never
 ) -> tuple[int, Reading | None, dict[int, float]] | None:
-    """The place of the model that explains held-out increments best, a doubt, and the squares by places; or None."""
+    """The place of the model that explains held-out increments best, a doubt, if any, and the squares by places.
+
+    The doubt is a reading of the data that leaves much less than all models. None in place of all for too few points.
+    """
     scales, d, fitted, others = data.scales, data.ndof, data.sample, held.sample
     affordable = [k for k, model in enumerate(models) if affords(fitted, model)]
     if not affordable or not others.runs:
@@ -215,8 +225,13 @@ def _left(model: Field, data: Trajectories, held: Trajectories, scales: np.ndarr
 # by slopes -----------------------------------------------------------------------------------------------------------
 
 
-def hint(library: Library, smooth: Smooth, data: Trajectories, force: Any = None, drives: Any = ()) -> str | None:
-    """The likeliest reason, none that the model has, why terms do not explain the data, with the remedy; or None."""
+def hint(
+    library: Library, smooth: Smooth, data: Trajectories, force: Force | None = None, drives: Sequence[Drive] = ()
+) -> str | None:
+    """The likeliest reason why the terms do not explain the data, with the remedy; None for none.
+
+    A force and drives that the model has already are no reason; beside any force friction is none.
+    """
     d, scales, smooth = data.ndof, data.scales, smooth.some(MOST_SLOPES)
     x, v = smooth.points, smooth.slopes
     X = library.fields(x)
@@ -319,7 +334,10 @@ def _columns(X: np.ndarray, scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 
 def drive_frequency(X: np.ndarray, smooth: Smooth, scales: np.ndarray, drive: Drive) -> float:
-    """The ω at which a drive explains most of what the fields X (n, 2d, K) leave of slopes."""
+    """The angular frequency at which a drive explains most of what the fields X (n, 2d, K) leave of slopes.
+
+    The peaks of the periodograms with each of its terms are compared by a fit of all, and the best is refined.
+    """
     d, most = X.shape[1] // 2, min(int(2 * smooth.longest / smooth.step), FREQUENCIES)
     frequencies = np.pi / smooth.longest * np.arange(0.5, max(most, 2) / 2, 0.25)
     beside = Rest.of(X, smooth.slopes, scales)
@@ -331,7 +349,9 @@ def drive_frequency(X: np.ndarray, smooth: Smooth, scales: np.ndarray, drive: Dr
     return _refined(X, smooth, scales, drive, likely, 0.5 * np.pi / smooth.longest)
 
 
-def _refined(X: np.ndarray, smooth: Smooth, scales: Any, drive: Drive, likely: Sequence[float], near: float) -> float:
+def _refined(
+    X: np.ndarray, smooth: Smooth, scales: np.ndarray, drive: Drive, likely: Sequence[float], near: float
+) -> float:
     """The angular frequency of a drive that leaves least, near the best of those that are likely."""
     beside = Rest.of(X, smooth.slopes, scales)
 
@@ -343,8 +363,13 @@ def _refined(X: np.ndarray, smooth: Smooth, scales: Any, drive: Drive, likely: S
     return float(found.x if found.fun < rest(best) else best)
 
 
-def driven(X: Any, smooth: Smooth, scales: Any, drive: Drive, known: Sequence[Drive] = ()) -> tuple[float, list[float]]:
-    """The share of other trajectories' squares that drives leave, infinite of a single trajectory, and their ω."""
+def driven(
+    X: np.ndarray, smooth: Smooth, scales: np.ndarray, drive: Drive, known: Sequence[Drive] = ()
+) -> tuple[float, list[float]]:
+    """The share of squares that drives leave, and their ω; of other trajectories than those that they were fitted to.
+
+    One trajectory cannot tell a drive from its own motion: infinite.
+    """
     first, v, near = smooth.owner % 2 == 0, smooth.slopes, 0.5 * np.pi / smooth.longest
 
     def theirs(A: np.ndarray) -> float:

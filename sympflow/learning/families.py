@@ -290,11 +290,19 @@ neural potentials, which are fitted to the data themselves, and no H is learned.
 
 
 def families(constraints: Constraints, name: str | None) -> list[str]:
-    """The names of the families that fit what is known; a ValueError if the one asked for does not."""
+    """The names of the families that fit what is known, or of the one that is asked for.
+
+    Raises
+    ------
+    ValueError
+        If there is no such family, or it contradicts what is known.
+    """
     if name is not None and name not in FAMILIES:
         raise ValueError(f"`family` {name!r} is unknown: choose from {', '.join(FAMILIES)}, or leave it out.")
     if name is not None and constraints.separable and not FAMILIES[name].separable:
-        raise ValueError(f"`family` {name!r} is of H(q, p), not separable: leave out `separable` or `family`.")
+        raise ValueError(
+            f"`family` {name!r} is of functions H(q, p), not separable: leave out `separable` or `family`."
+        )
     whole = constraints.separable is False or (name and not FAMILIES[name].separable)  # an H(q, p) is asked for
     if constraints.frequencies and whole:
         raise ValueError("`drive` is of a separable H: leave out `separable`, or the `family`.")
@@ -335,7 +343,15 @@ def with_unit_mass(candidate: Candidate, constraints: Constraints) -> Candidate 
 
 
 def pruned(candidate: Candidate, theta: np.ndarray, precision: np.ndarray, values: int) -> Candidate | None:
-    """The same model without the terms that Schwarz's criterion does not ask for; None if it asks for all."""
+    """The same model without the terms of sums that the data do not ask for; None if they ask for all.
+
+    Terms are left out one by one, that one first which, by the quadratic approximation of χ² at its minimum, raises it
+    least, as long as Schwarz's criterion gains: by less than the logarithm of the number of values.
+
+    References
+    ----------
+    .. [1] G. Schwarz, Estimating the dimension of a model, Ann. Statist. 6 (1978) 461–464.
+    """
     model = candidate.model
     droppable = np.zeros(model.n, dtype=bool)
     for part, place in zip(model.parts, model.places, strict=True):

@@ -120,7 +120,9 @@ class Fitted:
         return np.concatenate(self.fit.orbits, axis=1).T
 
 
-def fitted(model: Field, data: Trajectories, setting: Setting, theta: Any = None, seed: int = 0) -> Fitted:
+def fitted(
+    model: Field, data: Trajectories, setting: Setting, theta: np.ndarray | None = None, seed: int = 0
+) -> Fitted:
     """Fit a model from θ: to increments, to orbits of a few points, to orbits as long as their errors stay small."""
     scales = data.scales
     if theta is None:
@@ -323,7 +325,9 @@ def judged(found: Fitted, held: Trajectories, setting: Setting) -> Held:
     return Held(pieces.runs, tuple(residuals), losses, values, correlation, pairs, exact, loudness, excess, lag)
 
 
-def _correlation(runs: Sequence[Run], residuals: Sequence[Any], sigma: np.ndarray, lag: float) -> tuple[float, int]:
+def _correlation(
+    runs: Sequence[Run], residuals: Sequence[np.ndarray], sigma: np.ndarray, lag: float
+) -> tuple[float, int]:
     """The correlation of residuals with those a lag later, the next at least, NaN without any; and their number."""
     same = size = 0.0
     pairs = 0

@@ -11,7 +11,10 @@ from sympflow.learning.parts import Linear, Part, Waves
 
 
 class Inertia(Part):
-    """½ pᵀM(q)⁻¹p, M symmetric, its entries sums Σ_k θ_k f_k(q): linear in θ in Lagrange's equations."""
+    """½ pᵀM(q)⁻¹p, M symmetric, its entries sums Σ_k θ_k f_k(q) of given functions.
+
+    With v = M⁻¹p Lagrange's equations p = M v and p' = ½ vᵀ(∂M/∂q)v − ∂V/∂q are linear in θ, which gives a start.
+    """
 
     of, linear, inertial, terms = "y", False, True, True
 

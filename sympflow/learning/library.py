@@ -38,7 +38,10 @@ def coordinates_of(part: str, ndof: int) -> Coordinates:
 
 
 def polynomials(ndof: int, degree: int = 4) -> list[sp.Expr]:
-    """All products of powers up to a degree; of three or more degrees of freedom those of one, and of pairs."""
+    """All products of powers up to a degree; of three or more degrees of freedom those of one, and pairs.
+
+    Pairs (i, j) have p_i p_j, q_i p_j and powers of q_i − q_j, by which q_i q_j can be written.
+    """
     q, p = coordinates(ndof)
     sets = [(*q, *p)] if ndof <= MOST_PRODUCTS else list(zip(q, p, strict=True))
     terms = [
@@ -267,7 +270,9 @@ def _independent(library: Library, states: np.ndarray, named: set[sp.Expr]) -> l
         length = np.linalg.norm(column)
         if not np.isfinite(length):
             if library.expressions[k] in named:
-                raise ValueError(f"`terms` has {library.expressions[k]}, not finite at the data: leave it out.")
+                raise ValueError(
+                    f"`terms` has {library.expressions[k]}, which is not finite at the data: leave it out."
+                )
             continue
         rest = column - basis @ (basis.T @ column)
         rest -= basis @ (basis.T @ rest)

@@ -31,7 +31,9 @@ class OwnSteps(Stepper):
     longest: float
     cost = 1.0
 
-    def step(self, model: Any, theta: np.ndarray, x: np.ndarray, X: Any, h: np.ndarray, t: np.ndarray) -> Any:
+    def step(
+        self, model: Any, theta: np.ndarray, x: np.ndarray, X: np.ndarray | None, h: np.ndarray, t: np.ndarray
+    ) -> Any:
         return model.psi(theta, h, x, X)
 
     def orbit(self, over: Over, x: np.ndarray, X: np.ndarray | None, gaps: np.ndarray, t: np.ndarray) -> Orbit:
@@ -51,7 +53,10 @@ class OwnSteps(Stepper):
 
 
 class NetworkFlow(VectorField):
-    """A SympFlow whose weights are θ; palindromic, ψ_t = φ_{t/2} ∘ φ_{−t/2}⁻¹, it has twice the layers of φ."""
+    """A SympFlow with neural potentials, its weights θ the numbers of a model.
+
+    Palindromic, ψ_t = φ_{t/2} ∘ φ_{−t/2}⁻¹, so that ψ_{−t} = ψ_t⁻¹, it has twice the layers of φ and the weights of φ.
+    """
 
     separable = nystrom = lagrangian = linear = False
     forces = 0

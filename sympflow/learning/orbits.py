@@ -43,7 +43,10 @@ class Stepper(ABC):
 
     @abstractmethod
     def step(self, model: Field, theta: Array, x: Array, X: Array | None, h: Array, t: Array) -> Any:
-        """The states (2d, N) and derivatives (2d, c, N), by the start, then by θ, a time h (N,) after x and X at t."""
+        """The states (2d, N) and derivatives (2d, c, N) a time h (N,) after x and X at t, which may be overwritten.
+
+        The first 2d columns of X are those by the initial state, the others those by θ, if there are any.
+        """
 
     def orbit(self, over: Over, x: Array, X: Array | None, gaps: Array, t: Array) -> Orbit:
         """States and derivatives after each of the gaps (k, N) between points; the first gap follows t (N,)."""
@@ -230,7 +233,10 @@ def batches(runs: Sequence[Run], columns: int) -> list[Batch]:
 
 
 def first_states(data: Trajectories, model: VectorField | None = None, theta: Any = None) -> Array:
-    """A guess of the initial states (N, 2d): what was observed first, interpolated where a value is missing."""
+    """A guess of the initial states (N, 2d): what was observed first, interpolated where a value is missing.
+
+    Momenta are those of a model where velocities are observed.
+    """
     values = np.concatenate([run.y for run in data.runs], axis=1)
     middle = np.nanmean(np.where(np.isnan(values).all(axis=1, keepdims=True), 0.0, values), axis=1)
     states = np.empty((len(data.runs), 2 * data.ndof))

@@ -19,8 +19,8 @@ class Linear(NamedTuple):
     """A function f(θ, x) of columns x (m, N) with its derivatives, None for those that were not asked for."""
 
     value: np.ndarray  # (m, N)
-    slope: Any = None  # (m, m, N): ∂f/∂x
-    by_parameters: Any = None  # (m, n, N): ∂f/∂θ
+    slope: np.ndarray | Any = None  # (m, m, N): ∂f/∂x
+    by_parameters: np.ndarray | Any = None  # (m, n, N): ∂f/∂θ
 
 
 Curvature = Iterable[tuple[tuple[int, int], Any, np.ndarray]]
@@ -67,7 +67,10 @@ class Part(ABC):
         return self
 
     def momenta(self, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """p = ∂L/∂v and p' = ∂L/∂q at q and v (d, N) for θ = 0, and their derivatives by θ (2d, n, N)."""
+        """p = ∂L/∂v and p' = ∂L/∂q of a Lagrangian at q and v (d, N), for θ = 0; and their derivatives by θ (2d, n, N).
+
+        L has −V of what depends on q alone. Other parts stand in it with v in place of p, and numbers of their own.
+        """
         x = {"q": q, "p": v, "y": np.concatenate([q, v])}[self.of]
         f = self.gradient(np.zeros(self.n), x, False, True)
         return self._mechanics(f.value), self._mechanics(f.by_parameters)
@@ -239,7 +242,10 @@ def known_kinetic(inverse_mass: np.ndarray) -> Fixed:
 
 
 class Waves(Sum):
-    """Σ_m θ_m Π_i (x_i/s_i)^m_i cos(k_m·x + φ_m), exponents and k (n, m), φ (n,) 0 for cosines, −π/2 for sines."""
+    """Σ_m θ_m Π_i (x_i/s_i)^m_i cos(k_m·x + φ_m): Fourier series in angles, with powers of the other coordinates.
+
+    Exponents m and wave vectors k are (n, m), phases φ (n,): 0 for cosines, −π/2 for sines.
+    """
 
     def __init__(self, of: str, exponents: Any, waves: Any, phases: Any, scales: Any) -> None:
         self.of, self.waves, self.phases = of, np.asarray(waves, dtype=float), np.asarray(phases, dtype=float)
@@ -253,8 +259,13 @@ class Waves(Sum):
         return self.waves.shape[1]
 
     @classmethod
-    def up_to(cls, harmonics: int, degree: int, of: str, scales: Any, periods: Any, constant: bool = False) -> Waves:
-        """Harmonics of the angles to this order, times powers of the others; the constant first if asked for."""
+    def up_to(
+        cls, harmonics: int, degree: int, of: str, scales: Any, periods: np.ndarray, constant: bool = False
+    ) -> Waves:
+        """Harmonics to this order of the angles, which have a period, times powers of the others to this degree.
+
+        The constant, which moves nothing as a term of H, is the first term if it is asked for.
+        """
         angles = np.isfinite(periods)
         span = [range(-harmonics, harmonics + 1) if angle else (0,) for angle in angles]
         reach = [(0,) if angle else range(degree + 1) for angle in angles]
@@ -404,7 +415,10 @@ class Network(Part):
 
 
 class Distances(Part):
-    """Σ_k θ_k (r_k/s)^e_k, or log(r/s) where e is 0, of distances between bodies (n_bodies, dim) or from 0."""
+    """Σ_k θ_k (r_k/s)^e_k, of distances r between two bodies, or of one from the origin; log(r/s) where e is 0.
+
+    `bodies` (n_bodies, dim) are places in q, `terms` two bodies, or one and None for the origin, and e.
+    """
 
     of = "q"
     terms = True

@@ -349,7 +349,9 @@ def _column(columns: list[str], given: str | None, known: Sequence[str], argumen
     return given
 
 
-def _coordinates(rest: list[str], ndof: int | None, order: Any, q: Any, p: Any, velocities: bool) -> tuple[str, ...]:
+def _coordinates(
+    rest: list[str], ndof: int | None, order: str | Sequence[int], q: Any, p: Any, velocities: bool
+) -> tuple[str, ...]:
     """The columns of q1 … qd, p1 … pd."""
     if (q is None) != (p is None):
         raise ValueError("`q` and `p` go together: name the columns of both.")
@@ -472,7 +474,9 @@ def momenta_of(mass: ArrayLike, v: np.ndarray) -> np.ndarray:
         raise ValueError(f"`velocity_mass` must be a number, ({d},) or ({d}, {d}); got the shape {M.shape}.")
     whole = M if M.ndim == 2 else np.diag(np.broadcast_to(M, d))
     if not (np.isfinite(M).all() and np.allclose(whole, whole.T) and (np.linalg.eigvalsh(whole) > 0).all()):
-        raise ValueError(f"`velocity_mass` must be finite, symmetric and positive definite; got {mass!r}.")
+        raise ValueError(
+            f"`velocity_mass` must be finite, symmetric and positive definite, by which p = M v; got {mass!r}."
+        )
     return M @ v if M.ndim == 2 else (M if M.ndim == 0 else M[:, None]) * v
 
 

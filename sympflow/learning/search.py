@@ -128,7 +128,10 @@ def replica(common: tuple[Model, Trajectories, Setting, np.ndarray, int], number
 
 
 def without_growth(found: Fitted) -> Fitted:
-    """The fit with rates of friction that are not negative; one that is more than chance is told."""
+    """The fit with rates of friction that are not negative: those below 0 are 0, and other numbers the best beside.
+
+    Of data without friction chance makes half of the rates negative. One that is more than chance is told.
+    """
     model, theta = found.model, found.theta
     growing = np.arange(model.n) >= np.where(theta < 0, model.n - model.forces, model.n)
     if not growing.any():
@@ -175,7 +178,9 @@ class Search:
     setting: Setting
     seed: int
     history: list[dict[str, Any]] = field(default_factory=list)
-    best: Any = None  # The chosen model, as it was fitted without the held-out trajectories; None before there is one
+    best: Chosen | Any = (
+        None  # The chosen model, as it was fitted without the held-out trajectories; None before there is one
+    )
     identity: dict[str, Any] = field(default_factory=dict)
     done: dict[str, dict[str, Any]] = field(default_factory=dict)
     """The numbers of the models that were fitted, by their names."""
@@ -259,7 +264,12 @@ class Search:
         self.cut = deadline.over()
 
     def _ask(self, groups: list[Group], setting: Setting, session: Session) -> list[tuple[bool, list[Candidate]]]:
-        """Keep the best of the simple models if no H explains the data; else return those to try, in their order."""
+        """Keep the best of the simple models if no H explains the data, which is known before any other is fitted.
+
+        Where increments say so, orbits of that model are compared with those of another reading. The models of the
+        families are returned in the order in which they are to be tried, with True for those that are linear: those
+        that leave much more of increments than the best of all are the last.
+        """
         smooth = self.folds[0][0].sample
         queue = [(g.family.linear, [c for one in g.models for c in self._sparse(one, smooth)]) for g in groups]
         linear = [c for _, candidates in queue for c in candidates if c.model.linear or c.model.lagrangian]
@@ -434,7 +444,11 @@ class Search:
         warn(f"{said} {found or otherwise}")
 
     def freedom(self, setting: Setting) -> Freedom | None:
-        """The comparison with a field of polynomials, or a reading, that explains much more than any H; else None."""
+        """The comparison with a field that need not be Hamiltonian, where it explains much more than any H; else None.
+
+        A field of polynomials has those of all H(q, p) one degree higher, which must leave as much as the best model:
+        so that not only functions are missing.
+        """
         if not self.tested:
             self.tested.append(self._freedom(setting))
         return self.tested[0]

@@ -62,7 +62,8 @@ class Normal:
             found = np.linalg.solve(damped, np.concatenate([self.B, self.a[..., None]], axis=2))
         except np.linalg.LinAlgError:
             return None
-        Q, x, theta = found[..., :n], found[..., n], np.zeros(n)
+        Q, x = found[..., :n], found[..., n]
+        theta = np.zeros(n)
         if n:
             flat = self.B.reshape(N * m, n)
             S, D = self.C - flat.T @ Q.reshape(N * m, n), np.sqrt(np.where(scale > 0, scale, 1.0))
@@ -286,6 +287,7 @@ class Fit:
 def _robust_variances(r: np.ndarray, huber: float) -> np.ndarray:
     """σ² of rows (2d, n) by Huber's proposal 2: the mean of min(r², k²σ²) is that of normal residuals."""
     density, inside = math.exp(-huber * huber / 2) / math.sqrt(2 * math.pi), math.erf(huber / math.sqrt(2))
+    # the mean of min(z², k²) of a normal z
     expected = inside - 2 * huber * density + huber * huber * (1 - inside)
     made = np.empty(len(r))
     for i, row in enumerate(r):
@@ -368,7 +370,11 @@ class _Arrow(LinearModel):
 def chosen_method(
     model: Field, theta: np.ndarray, data: Trajectories, tolerance: np.ndarray, halvings: int = 12, stop: Stop = never
 ) -> Method:
-    """The cheapest scheme and step whose error over single gaps, against half the step, is below a tolerance (2d,)."""
+    """The cheapest scheme and step whose error over the gaps between points is below a tolerance (2d,).
+
+    The error is that over single gaps, from observed states, against half the step. The step is the widest gap, halved
+    so many times at most.
+    """
     if model.stepper is not None:
         return Method(model.stepper, model.stepper.longest)
     starts, gaps, times = _gaps(data)
@@ -415,14 +421,20 @@ def _gaps(data: Trajectories) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")
-def _ends(model: Field, theta: np.ndarray, method: Method, x: np.ndarray, gaps: Any, t: Any) -> np.ndarray:
+def _ends(
+    model: Field, theta: np.ndarray, method: Method, x: np.ndarray, gaps: np.ndarray, t: np.ndarray
+) -> np.ndarray:
     return model.observed(theta, method.over(model, theta, x.copy(), None, gaps, t)[0], None)[0]
 
 
 def matched(
     model: Field, theta: np.ndarray, data: Trajectories, weights: np.ndarray, steps: int = 1, stop: Stop = never
 ) -> np.ndarray:
-    """θ by least squares of y(t) − ∫ f_θ(y) dt along the observed states, less a constant for each piece."""
+    """θ by which the observed increments are the integrals of the field along the observed states, by least squares.
+
+    No orbit is computed: y(t) − ∫ f_θ(y) dt is compared with a constant for each piece. That is linear where f is
+    linear in θ, and one step solves it.
+    """
     pieces = [run for run in map(_whole, data.runs) if run.n_points > 1]
     if not pieces:
         return theta
@@ -469,7 +481,9 @@ def _whole(run: Run) -> Run:
 
 
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")
-def _increments(model: Field, theta: np.ndarray, pieces: Sequence[Run], weights: Any) -> tuple[np.ndarray, np.ndarray]:
+def _increments(
+    model: Field, theta: np.ndarray, pieces: Sequence[Run], weights: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """The increments less the integrals of the field, and minus their derivative by θ."""
     here = model.at(np.concatenate([run.t for run in pieces]))
     f = here.field(theta, np.concatenate([run.y for run in pieces], axis=1), False, True)

@@ -44,7 +44,11 @@ class Smooth:
 
 
 def smoothed(runs: Sequence[Run], velocities: bool) -> Smooth:
-    """Local cubic polynomials through each coordinate; differences where there are fewer than six points."""
+    """Local cubic polynomials through each coordinate, the width of their windows by leave-one-out cross-validation.
+
+    Of trajectories with fewer than six points the derivatives are differences, at the mean of two states. Velocities
+    that are missing are the derivatives of the positions.
+    """
     given, runs = runs, [_with_velocities(run) for run in runs] if velocities else runs
     made = [_curve(run) for run in runs]
     middle = np.nanmean(np.concatenate([run.y for run in runs], axis=1), axis=1)

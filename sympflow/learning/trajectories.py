@@ -293,8 +293,8 @@ class Trajectories(Shown):
                 )
             if seen.size and not 1 / LARGEST < np.abs(seen).max() < LARGEST:
                 raise ValueError(
-                    f"`trajectories` have {name} up to {np.abs(seen).max():.1g}, whose powers are no numbers of this "
-                    "machine: give `units`, or numbers nearer to 1."
+                    f"`trajectories` have {name} up to {np.abs(seen).max():.1g}, whose powers overflow or vanish: "
+                    "give `units`, or numbers nearer to 1."
                 )
             if seen.size and abs(seen.mean()) > FAR * seen.std() > 0:
                 warn(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import scipy.linalg
@@ -23,7 +22,10 @@ RADIUS = 0.1  # Radius of a domain around a trajectory, in the spread of each co
 
 
 def unseen(states: np.ndarray, errors: np.ndarray, columns: Sequence[int], part: Part | None = None) -> list[sp.Expr]:
-    """Functions of some coordinates that are the same at all states: linear ones, or else quadratic ones."""
+    """Functions of some coordinates that are the same at all states: linear ones, or else quadratic ones.
+
+    Of q and p together only linear ones: of few orbits some sum of the integrals of motion always has one value.
+    """
     d, x = states.shape[1] // 2, states[:, [*columns]].T
     names = [sp.Symbol(f"{'qp'[i // d]}{i % d + 1}", real=True) for i in columns]
     low, high = x.min(axis=1), x.max(axis=1)
@@ -37,7 +39,9 @@ def unseen(states: np.ndarray, errors: np.ndarray, columns: Sequence[int], part:
     return []
 
 
-def _same(part: Part, x: np.ndarray, errors: Any, names: Any, middle: np.ndarray, half: np.ndarray) -> list[sp.Expr]:
+def _same(
+    part: Part, x: np.ndarray, errors: np.ndarray, names: list[sp.Symbol], middle: np.ndarray, half: np.ndarray
+) -> list[sp.Expr]:
     """The sums of terms of a part, at coordinates (m, N) less their middle, that are the same at all points."""
     centre = (x.min(axis=1) + x.max(axis=1)) / 2
     box = centre[:, None] + half[:, None] * np.random.default_rng(0).uniform(-1, 1, (len(x), SAMPLED))

@@ -255,7 +255,9 @@ def gali(
     orbits = checked_orbits(system, method, t_span, y0, options, "deviation vectors are followed on")
     check_counts(k=k)
     if not 2 <= k <= 2 * system.ndof:
-        raise ValueError(f"`k` must be from 2 to {2 * system.ndof}, the dimension of phase space; got {k}.")
+        raise ValueError(
+            f"`k` must be from 2 to {2 * system.ndof}, the dimension of the phase space of {system.called}; got {k}."
+        )
     return indicator(orbits, int(k), VOLUME, checked_threshold(below), t_eval, deviations, seed, backend)
 
 
@@ -353,7 +355,14 @@ def _deviations(given: ArrayLike | None, vectors: int, scale: np.ndarray, seed: 
 
 
 def _compiled(
-    kernel: Any, grid: Grid, orbits: Orbits, w0: Any, scale: np.ndarray, times: np.ndarray, kind: int, below: float
+    kernel: Any,
+    grid: Grid,
+    orbits: Orbits,
+    w0: np.ndarray,
+    scale: np.ndarray,
+    times: np.ndarray,
+    kind: int,
+    below: float,
 ) -> _Run:
     counts = np.array([grid.place(t)[0] for t in times], dtype=np.int64)
     save, where = np.unique(counts[counts > 0], return_inverse=True)

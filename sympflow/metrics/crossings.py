@@ -6,7 +6,7 @@ Also the states after whole periods, the crossings of a driven system with the p
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -43,7 +43,12 @@ class Crossings(NamedTuple):
 
 
 def crossings(
-    integrator: Integrator, system: HamiltonianSystem, t_span: Any, rows: np.ndarray, plane: Plane, sample: float
+    integrator: Integrator,
+    system: HamiltonianSystem,
+    t_span: tuple[float, float],
+    rows: np.ndarray,
+    plane: Plane,
+    sample: float,
 ) -> Crossings:
     """All crossings of the trajectories from `rows` (N, 2d), two of one within the time `sample` excepted."""
     if isinstance(integrator, FixedStep) and integrator.on_grid:
@@ -56,7 +61,11 @@ def crossings(
 def stroboscopic(
     integrator: Integrator, system: HamiltonianSystem, t_span: tuple[float, float], rows: np.ndarray, period: float
 ) -> Crossings:
-    """The states (n, 2d) at t0 + k·T of trajectories from `rows` (N, 2d), ends of fixed steps T/m, else outputs."""
+    """The states (n, 2d) at t0 + k·T of the trajectories from `rows` (N, 2d), those at t0 among them.
+
+    Fixed steps are shortened to T/m with a whole m, so that all these times are ends of steps; trained flows, which are
+    other maps at other steps, and methods that choose theirs are asked for them as outputs.
+    """
     t0, t1 = t_span
     n, turn = whole_periods(t_span, period), float(np.copysign(period, t1 - t0))
     y0 = rows[0] if len(rows) == 1 else rows
@@ -85,7 +94,12 @@ def dividing_step(period: float, longest: float) -> float:
 
 
 def _by_events(
-    integrator: Integrator, system: HamiltonianSystem, t_span: Any, rows: np.ndarray, plane: Plane, sample: float
+    integrator: Integrator,
+    system: HamiltonianSystem,
+    t_span: tuple[float, float],
+    rows: np.ndarray,
+    plane: Plane,
+    sample: float,
 ) -> Crossings:
     """The crossings of trajectories that take steps of their own: events of each."""
 
@@ -166,7 +180,9 @@ class _Search:
                 self._locate(t, y, h, crossed, part / parts, (part + 1) / parts, before)
             before = after
 
-    def _locate(self, t: np.ndarray, y: np.ndarray, h: Any, crossed: Any, a: float, b: float, before: Any) -> None:
+    def _locate(
+        self, t: np.ndarray, y: np.ndarray, h: np.ndarray, crossed: np.ndarray, a: float, b: float, before: np.ndarray
+    ) -> None:
         """Bisect all crossings together, in the fraction of the step."""
         y, t, h, sign = y[crossed], t[crossed], h[crossed], np.sign(before[crossed])
         low, high = np.full(len(y), a), np.where(sign == 0, a, b)

@@ -125,7 +125,10 @@ def angular_momentum(solution: Solution | ArrayLike, system: HamiltonianSystem |
     """
     q, p, timed = _bodies(solution, system)
     if q.shape[-1] != 3:
-        raise ValueError(f"`system` has bodies in {q.shape[-1]} dimensions, angular momentum is of three: use these.")
+        raise ValueError(
+            f"`system` has bodies in {q.shape[-1]} dimensions, and angular momentum is defined in three: use bodies in "
+            "three dimensions."
+        )
     total = np.cross(q, p).sum(-2)
     return np.moveaxis(total, 0, -1) if timed else total
 

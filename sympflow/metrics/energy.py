@@ -125,7 +125,9 @@ def energy_drift(sol: Solution, blocks: int = MIN_BLOCKS, relative: bool = True)
         raise ValueError(f"`blocks` must be at least {MIN_BLOCKS} for a meaningful standard error; got {blocks}.")
     n, lost = len(sol.t), failed(sol)
     if n < blocks and not lost.all():
-        raise ValueError(f"`sol` has {n} outputs, fewer than the {blocks} blocks of the fit: ask for more by `t_eval`.")
+        raise ValueError(
+            f"`sol` has {n} outputs, fewer than the {blocks} blocks of the fit: ask for more with `t_eval`."
+        )
     batch = sol.y.shape[:-2]
     if n < blocks:
         infinite = np.full(batch, np.inf)[()]

@@ -124,7 +124,9 @@ def region_of(outside: Any, system: HamiltonianSystem) -> Outside:
     """The function of states that `outside` means; a ValueError or TypeError if it is none."""
     if outside is None:
         if system.domain is None:
-            raise ValueError(f"`outside` is needed: {system.called} has no domain: pass a radius, domain or function.")
+            raise ValueError(
+                f"`outside` is needed, as {system.called} has no domain: pass a radius, a domain or a function."
+            )
         outside = system.domain
     if real_number(outside):
         if not 0 < outside < np.inf:
@@ -134,7 +136,9 @@ def region_of(outside: Any, system: HamiltonianSystem) -> Outside:
     if contains is not None:
         return lambda y: ~contains(y)
     if not callable(outside):
-        raise TypeError(f"`outside` must be a radius, a domain, or a function of states; got {type(outside).__name__}.")
+        raise TypeError(
+            f"`outside` must be a radius, a domain, or a function of states (..., 2d); got {type(outside).__name__}."
+        )
     return outside
 
 

@@ -278,8 +278,19 @@ class SmallOscillations:
         return float(self.frequencies.max(initial=0.0))
 
 
-def small_oscillations(system: HamiltonianSystem, y0: np.ndarray, orbit: Callable[[], Any]) -> SmallOscillations | None:
-    """The frequencies about a stable equilibrium, else the largest along an orbit; None if there are none."""
+def small_oscillations(
+    system: HamiltonianSystem, y0: np.ndarray, orbit: Callable[[], np.ndarray]
+) -> SmallOscillations | None:
+    """Return the frequencies about a stable equilibrium, else the largest along an orbit; None if there are none.
+
+    Parameters
+    ----------
+    system : HamiltonianSystem
+    y0 : ndarray (2d,)
+        The equilibrium, of no higher energy, is sought from the origin and from there.
+    orbit : callable
+        Gives states (n, 2d) along the orbit, which are looked at where there is no equilibrium.
+    """
     with np.errstate(all="ignore"):
         try:
             center = _equilibrium(system, y0)
@@ -345,7 +356,9 @@ def _quadratic(system: HamiltonianSystem, y0: np.ndarray) -> bool:
     return bool(np.abs(hessians - hessians[0]).max() <= 1e-12 * np.abs(hessians[0]).max())
 
 
-def of_method(integrator: Integrator, system: HamiltonianSystem, small: Any, longest: float) -> LinearStability | None:
+def of_method(
+    integrator: Integrator, system: HamiltonianSystem, small: SmallOscillations, longest: float
+) -> LinearStability | None:
     """Return the steps, up to `longest`, at which a method keeps small oscillations of a system bounded.
 
     Exact for kicks and drifts; for another method with steps on a grid its step at the equilibrium is differentiated,

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import warnings
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
@@ -79,7 +78,9 @@ def reference(
     return run(system, t_span, y0, t, target)
 
 
-def _kahan_li(system: HamiltonianSystem, t_span: Any, y0: np.ndarray, t: np.ndarray, target: float) -> Reference:
+def _kahan_li(
+    system: HamiltonianSystem, t_span: tuple[float, float], y0: np.ndarray, t: np.ndarray, target: float
+) -> Reference:
     dt = 4 * system.dt
     previous, best, apart = None, None, math.inf
     for _ in range(_HALVINGS):
@@ -105,13 +106,16 @@ def _kahan_li(system: HamiltonianSystem, t_span: Any, y0: np.ndarray, t: np.ndar
     return best
 
 
-def _dop853(system: HamiltonianSystem, t_span: Any, y0: np.ndarray, t: np.ndarray, target: float) -> Reference:
+def _dop853(
+    system: HamiltonianSystem, t_span: tuple[float, float], y0: np.ndarray, t: np.ndarray, target: float
+) -> Reference:
     smallest = smallest_size(system, y0)
     fine, coarse = (
         solve(system, "dop853", t_span, y0, t_eval=t, rtol=rtol, atol=rtol * smallest).raise_for_status()
         for rtol in (1e-13, 1e-12)
     )
-    return Reference(t, y := to_numpy(fine.y), "DOP853, rtol = 1e-13", _distance(system, y - to_numpy(coarse.y)))
+    y = to_numpy(fine.y)
+    return Reference(t, y, "DOP853, rtol = 1e-13", _distance(system, y - to_numpy(coarse.y)))
 
 
 def _distance(system: HamiltonianSystem, change: np.ndarray) -> float:
@@ -122,7 +126,10 @@ def _distance(system: HamiltonianSystem, change: np.ndarray) -> float:
 
 
 def _linear_flow(system: HamiltonianSystem, t: np.ndarray, y0: np.ndarray) -> np.ndarray | None:
-    """The exact solution for H = ½ xᵀSx, S = LLᵀ: z = Lᵀx rotates, z' = LᵀJL z; None for another H."""
+    """The exact solution for H = ½ xᵀSx with S positive definite, which symbols tell; else None.
+
+    With S = LLᵀ the variables z = Lᵀx rotate, z' = LᵀJL z, so the error is that of the phase alone: ε·ω·t.
+    """
     if system.written is None:
         return None
     import sympy

@@ -87,7 +87,9 @@ def volume_error(sol: Solution, over_time: bool = False) -> np.floating | np.nda
 
 
 def _check_kept(sol: Solution, what: str) -> None:
-    sol.system.check_conservative(f"by which phase-space {what} is not kept", "use sympflow.conformal_defect(sol)")
+    sol.system.check_conservative(
+        f"by which phase-space {what} shrinks and is not kept", "use sympflow.conformal_defect(sol)"
+    )
 
 
 def _hold(series: np.ndarray, ends: np.ndarray, values: np.ndarray, t: np.ndarray) -> None:

@@ -45,7 +45,10 @@ def new_figure(width: float, height: float) -> Figure:
 
 
 def method_styles(labels: Sequence[tuple[str, str]]) -> dict[str, tuple[str, str]]:
-    """Colour and marker for each (label, method): one of the paper's has its own, borne by its name or the first."""
+    """Colour and marker for each (label, method).
+
+    Each method of the paper has its own, borne by the one that is labelled with its name, or else by the first.
+    """
     own = {method: label for label, method in reversed(labels)} | {m: label for label, m in labels if label == m}
     styles: dict[str, tuple[str, str]] = {}
     others = 0
@@ -61,7 +64,11 @@ def method_styles(labels: Sequence[tuple[str, str]]) -> dict[str, tuple[str, str
 
 
 def frame(ax: Axes, points: np.ndarray, margin: float) -> None:
-    """Limits around points (n, 2) with a margin, as a share of their extent, a tenth of the largest at least."""
+    """Limits around points (n, 2) with a margin, as a share of their extent.
+
+    An extent below a tenth of the largest coordinate counts as that: where all points are one, the rounding of its
+    coordinates is not magnified into a picture.
+    """
     points = points[np.isfinite(points).all(1)]
     if not len(points):
         return
@@ -78,7 +85,11 @@ def labelled(axes: Iterable[Axes]) -> list[Any]:
 
 
 def legend_above(figure: Figure, handles: Sequence[Any], columns: int) -> None:
-    """One legend above all panels, in at most so many columns, for whose further lines the figure grows."""
+    """One legend above all panels, in at most so many columns, within the width of the figure.
+
+    Long labels are broken. The figure grows by the lines of the legend beyond the second, so that these take nothing
+    from the panels.
+    """
     longest = min(LONGEST_LABEL, figure.get_figwidth() - 0.8)  # a line takes its part
     labels = [filled(str(h.get_label()), longest, 9) for h in handles]
     for n in range(min(len(handles), columns), 0, -1):

@@ -43,7 +43,11 @@ class Identified(Protocol):
 
 @dataclass
 class Known:
-    """The identity of a call as texts by name, `python` of those with code, and `untold` with what cannot be told."""
+    """The identity of a call, by which a store knows it again: texts by the names of arguments and the like.
+
+    `python` are the names of those in which there are functions or objects of Python, and not values alone; `untold`
+    those with a part that cannot be told from another, and that part.
+    """
 
     texts: dict[str, str] = field(default_factory=dict)
     python: set[str] = field(default_factory=set)

@@ -68,7 +68,12 @@ def imported(library: str, what: str) -> Any:
 
 
 def table(data: xarray.Dataset, rows: Iterable[str]) -> pandas.DataFrame:
-    """The arrays of a Dataset as columns, q1 … qd along `dof`, else name_0, …, a row for each index along `rows`."""
+    """Return the arrays of a Dataset as columns, with a row for each index along some dimensions.
+
+    The columns are these dimensions, what is known along them, and of arrays with more dimensions one for each entry:
+    q1 … qd along `dof`, else name_0, name_1, name_0_1. Arrays without any of the `rows` are left out, and where these
+    are times the initial states. `attrs` are those of the Dataset.
+    """
     pd = imported("pandas", "to_dataframe()")
     dims = [dim for dim in rows if dim in data.sizes]
     shape = tuple(data.sizes[dim] for dim in dims)

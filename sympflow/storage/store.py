@@ -56,12 +56,16 @@ class StoreError(OSError):
 
 @dataclass(frozen=True)
 class Field:
-    """An array of a store; `chunks` is by default all of it, `missing` the number where nothing was written."""
+    """An array of a store, of numbers or truth values; fields that share a dimension have the same length along it.
+
+    `chunks` is by default the whole array. `missing` is the number where nothing has been written, which a reader of
+    zarr may show as NaN; the default is NaN, or 0 of other numbers than floats.
+    """
 
     dims: tuple[str, ...]
     shape: tuple[int, ...]
     dtype: Any = float
-    chunks: Any = None  # of int, one for each dimension; None for the whole array
+    chunks: tuple[int, ...] | Any = None  # None for the whole array
     attributes: Mapping[str, Any] = field(default_factory=dict)
     missing: int | None = None
 
@@ -132,7 +136,10 @@ class Store:
         attributes: Mapping[str, Any],
         values: Mapping[str, np.ndarray] | None = None,
     ) -> Store:
-        """Make a store beside its place, and move it there, with the values of some arrays of one chunk."""
+        """Make a store, with the values of some arrays of one chunk; the others have none.
+
+        It is made beside its place, and moved there: it is whole, or it is not there.
+        """
         place = Path(path)
         for name in fields:
             if not is_name(name):
@@ -230,7 +237,15 @@ class Store:
         return self._file(name, index).exists()
 
     def write(self, name: str, index: tuple[int, ...], values: np.ndarray) -> None:
-        """Write one chunk, into which `values` must fit; at the edge of the array they may be smaller."""
+        """Write one chunk; at the edge of the array, or of one that is to grow, `values` may be smaller than a chunk.
+
+        Raises
+        ------
+        ValueError
+            If the values do not fit into the chunk.
+        StoreError
+            If they cannot be written, as on a full disk.
+        """
         known, values = self.fields[name], np.asarray(values)
         if values.ndim != len(known.chunks) or (np.array(values.shape) > known.chunks).any():
             raise ValueError(f"`values` of shape {values.shape} are not a chunk of {name!r}, of shape {known.chunks}.")
@@ -390,7 +405,9 @@ class Appender:
             self.tails[name] = [rest.copy()]
         self.held -= n_chunks * self.size
 
-    def commit(self, attributes: Mapping[str, Any] | None = None, state: Mapping[str, Any] | None = None) -> None:
+    def commit(
+        self, attributes: Mapping[str, Any] | None = None, state: Mapping[str, np.ndarray] | None = None
+    ) -> None:
         """Write what is in memory, and commit the store with its new length: see `Store.commit`."""
         if self.held:
             k = self.length // self.size

@@ -100,7 +100,12 @@ GOLDEN = (math.sqrt(5) - 1) / 2
 
 
 def instants(t0: float, t1: float, n: int, dt: float) -> np.ndarray:
-    """The times (n,) of a comparison: one in each n-th of the interval, by the golden section, the last at its end."""
+    """The times (n,) at which methods are compared: one in each n-th of the interval, the last at its end.
+
+    Their places within these parts go on by the golden section, so that they meet all phases of an oscillation even
+    where its period divides the parts. They are ends of steps dt where a part holds two of these or more, so that a
+    method makes no other steps for them.
+    """
     k = np.arange(1, n)
     elapsed = (k - 1 + (GOLDEN * k) % 1) * (abs(t1 - t0) / n)
     if 2 * dt * n <= abs(t1 - t0):
@@ -339,8 +344,13 @@ class Attempt:
         if sol.success and "domain_exit" in stats:
             self.note(f"The state left the flow's domain at t = {stats['domain_exit']:.4g}.")
 
-    def warm_up(self, run: Callable[..., Any], t: np.ndarray, t0: float, dt: float) -> None:
-        """Compile what the candidate's runs need, and enter the time that it took; `dt` is a step of the system."""
+    def warm_up(
+        self, run: Callable[[Any, tuple[float, float], np.ndarray], object], t: np.ndarray, t0: float, dt: float
+    ) -> None:
+        """Compile what the candidate's runs need, and enter the time that it took; a run that fails is left to `run`.
+
+        `dt` is a step of the system, for methods that choose theirs.
+        """
         integrator = self.candidate.integrator
         if integrator is None:
             return
@@ -453,7 +463,10 @@ class RunTime(NamedTuple):
 
 
 def interleaved(calls: Sequence[Callable[[], object]], repeats: int) -> list[RunTime]:
-    """Time every call `repeats` times, going round over all of them, so that a slow spell of the machine hits each."""
+    """Time every call `repeats` times, going round over all of them, so that a slow spell of the machine hits each.
+
+    The calls should have run before, or been warmed up: see `warm_up`.
+    """
     if not calls:
         return []
     passed = np.empty((repeats, len(calls)))
@@ -471,7 +484,24 @@ WARM_STEPS = 3.5  # steps of a run that compiles: whole ones, and the shorter on
 
 
 def warm_up(run: Callable[[tuple[float, float], np.ndarray], object], step: float, t: np.ndarray, t0: float) -> float:
-    """Make a run twice over a few steps, so that all is compiled; the seconds of the first beyond the second."""
+    """Make a run twice over a few steps, so that all that a long one needs is compiled; the seconds of doing so.
+
+    Parameters
+    ----------
+    run : callable
+        Solves over an interval with outputs at some instants.
+    step : float
+        Length of a step, about.
+    t : ndarray (n,)
+        The instants of the long run, up to its end: the short one has as many.
+    t0 : float
+        Its start.
+
+    Returns
+    -------
+    float
+        The time of the first run beyond that of the second.
+    """
     length = float(t[-1]) - t0
     short = math.copysign(min(abs(length), WARM_STEPS * step), length)
     times = t0 + (t - t0) * (short / length)

@@ -195,7 +195,9 @@ def _instants(reference: object, t0: float, t1: float, n: int, dt: float) -> np.
     return attempts.instants(t0, t1, n, dt) if reference is None else np.linspace(t0, t1, n + 1)[1:]
 
 
-def _given(reference: Any, system: HamiltonianSystem, t0: float, y0: np.ndarray, t: np.ndarray) -> Reference:
+def _given(
+    reference: Reference | Solution | ArrayLike, system: HamiltonianSystem, t0: float, y0: np.ndarray, t: np.ndarray
+) -> Reference:
     """The reference that was given, if it is one and fits."""
     if isinstance(reference, Reference | Solution):
         if len(reference.t) != len(t):
@@ -305,9 +307,25 @@ def tuned(integrator: Integrator, system: HamiltonianSystem, factor: float) -> I
 
 
 def matched(
-    integrator: Integrator, system: HamiltonianSystem, measure: Callable[[Any], float], target: float, grows: bool
+    integrator: Integrator,
+    system: HamiltonianSystem,
+    measure: Callable[[Integrator], float],
+    target: float,
+    grows: bool,
 ) -> tuple[Integrator, float]:
-    """Tune an integrator until `measure` is within 5 % of `target`; return the nearest found, and its figure."""
+    """Tune the integrator until `measure` is within 5 % of `target`; return the nearest found, and its figure.
+
+    Parameters
+    ----------
+    measure : callable
+        A positive figure of a run; inf if the run fails, which asks for smaller steps.
+    grows : bool
+        True if the figure grows with the step (an error), False if it falls (a cost).
+
+    Notes
+    -----
+    The secant method on the logarithms, safeguarded by the nearest points found on either side.
+    """
     x, slope = 0.0, (2.0 if grows else -1.0)
     below: tuple[float, float] | None = None  # (x, f) with too small a step, and with too large a one
     above: tuple[float, float] | None = None
@@ -428,7 +446,10 @@ class Comparison(Report):
 
 
 def combined_table(comparisons: Sequence[Comparison], width: int | None = None) -> str:
-    """The rows of several comparisons as one table; the methods as columns where `width` does not hold it."""
+    """The rows of several comparisons as one table, with the settings above and the reasons below.
+
+    Where `width` characters do not hold it, there is a table for each system with the methods as columns.
+    """
     rows, several = [row for c in comparisons for row in c.rows], len(comparisons) > 1
     names = [c.title for c in comparisons for _ in c.rows]
     first = [i == 0 for c in comparisons for i in range(len(c.rows))]
@@ -458,7 +479,7 @@ def _upright(columns: Sequence[Column]) -> str:
 def _columns(rows: Sequence[Row]) -> list[Column]:
     titles = [title for title in CELLS if title not in ("batch", "rtol", "±", "steps", "leaves domain at t")]
     own: dict[str, Callable[[Row], str]] = {
-        "step": lambda row: CELLS["step"](row) or f"rtol {CELLS['rtol'](row)}".removesuffix("rtol "),
+        "step": lambda row: CELLS["step"](row) if row.tolerance is None else f"rtol {CELLS['rtol'](row)}",
         "run time": lambda row: (
             f"{seconds(row.run_time)} ± {100 * row.run_time_spread / row.run_time:2.0f} %"
             if row.run_time and row.run_time_spread is not None

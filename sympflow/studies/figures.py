@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
 from sympflow.arguments import check_one_of
 from sympflow.arrays import to_numpy
 from sympflow.hamiltonian.scales import smallest_size
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.registry import build
 from sympflow.metrics.crossings import Plane, crossings, stroboscopic, whole_periods
 from sympflow.show.style import TEXT, dress, filled, frame, labelled, legend_above, method_styles, new_figure, save
@@ -38,14 +40,41 @@ SMALLEST, LARGEST = 1e-15, 1e3  # errors shown in figures of stability
 UNSTABLE = "#5A1020"
 _GREEK = {"omega": "ω"}
 
-Compared = Any  # a `Comparison`, whose module imports this one
+
+class Compared(Protocol):
+    """The part of a comparison that is drawn."""
+
+    @property
+    def system(self) -> HamiltonianSystem: ...
+    @property
+    def title(self) -> str: ...
+    @property
+    def t_span(self) -> tuple[float, float]: ...
+    @property
+    def y0(self) -> np.ndarray: ...
+    @property
+    def t(self) -> np.ndarray: ...
+    @property
+    def metrics(self) -> tuple[str, ...]: ...
+    @property
+    def runs(self) -> tuple[Attempt, ...]: ...
 
 
 # comparisons ----------------------------------------------------------------------------------------------------------
 
 
 def comparison_figure(comparison: Compared, kind: str = "overview") -> Figure:
-    """One figure of a comparison, of the kinds in `KINDS`; a ValueError if it was not measured."""
+    """One figure of a comparison: "overview", "energy", "volume", "error" or "portrait".
+
+    The overview of a comparison that measured none of its panels is the portrait.
+
+    Raises
+    ------
+    ValueError
+        For an unknown kind, or one whose metric was not asked for.
+    ImportError
+        Without matplotlib.
+    """
     check_one_of("kind", kind, KINDS)
     if kind == "overview":
         return portrait(comparison) if _drawable(comparison) == ("portrait",) else overview([comparison])
@@ -62,7 +91,9 @@ def comparison_figure(comparison: Compared, kind: str = "overview") -> Figure:
     return figure
 
 
-def save_comparison(comparison: Compared, path: Any, kind: str = "overview", prefix: str = "") -> list[Path]:
+def save_comparison(
+    comparison: Compared, path: str | os.PathLike[str], kind: str = "overview", prefix: str = ""
+) -> list[Path]:
     """Save one figure to a file; into a folder the overview saves every kind that was measured. The files written."""
     path = Path(path)
     if path.suffix.lower() in FIGURE_FILES:
@@ -74,7 +105,10 @@ def save_comparison(comparison: Compared, path: Any, kind: str = "overview", pre
 
 
 def overview(comparisons: Sequence[Compared]) -> Figure:
-    """One row for each system: error against run time, energy and volume errors over time, as far as asked for."""
+    """One row for each system: error against run time, energy error over time, volume error over time.
+
+    Panels of metrics that were not asked for are left out.
+    """
     kinds = [k for k in _PANELS if any(k in _panels(c) for c in comparisons)]
     if not kinds:
         raise ValueError("`comparisons` hold nothing to draw: ask compare() for 'error', 'energy' or 'volume'.")
@@ -246,7 +280,11 @@ def _overlap(one: tuple[np.ndarray, np.ndarray], other: tuple[np.ndarray, np.nda
 
 
 def portrait(comparison: Compared) -> Figure:
-    """Phase space, a panel for each method with the reference in grey: (q, p), the section q₁ = 0, or q₁ against q₂."""
+    """Phase space, a panel for each method with the reference behind in grey.
+
+    One degree of freedom: the orbit in the (q, p) plane. Two: the Poincaré section q₁ = 0 with q₁ increasing along the
+    run, on each method's own map. More: q₁ against q₂. Of a driven system the states after each period, q₁ against p₁.
+    """
     system, runs = comparison.system, [run for run in comparison.runs if run.sol is not None]
     rows = -(-len(runs) // 5)
     columns = -(-len(runs) // rows)
@@ -309,7 +347,15 @@ def _reference_points(comparison: Compared) -> np.ndarray:
 
 
 def precision_figure(rows: Sequence[Row], heading: str, measure: str = "energy_error") -> Figure:
-    """Cost against error, log–log: run time and evaluations; a row for each batch size."""
+    """Cost against error, log–log: run time on the left, evaluations on the right; a row for each batch size.
+
+    Points whose error the reference cannot resolve are hollow. Trained flows have no evaluations of the force.
+
+    Raises
+    ------
+    ValueError
+        For another measure than "energy_error", "balance_error" or "error".
+    """
     check_one_of("measure", measure, MEASURES)
     sizes = sorted({row.trajectories for row in rows})
     figure = new_figure(9.6, 0.8 + 3.9 * len(sizes))
@@ -397,8 +443,18 @@ def _shown(row: Row) -> float:
     return LARGEST if error is None or not math.isfinite(error) else min(max(error, SMALLEST), LARGEST)
 
 
-def stability_map(all_rows: Sequence[Row], limits: Mapping[str, Any], missing: Sequence[str]) -> Figure:
-    """A panel for each method: step against stiffness, coloured by energy error; × where it says nothing."""
+def stability_map(
+    all_rows: Sequence[Row], limits: Mapping[str, Sequence[tuple[float, float]]], missing: Sequence[str]
+) -> Figure:
+    """A panel for each method: step against stiffness, coloured by energy error; × where it says nothing.
+
+    Parameters
+    ----------
+    limits : mapping
+        For each label the points (longest stable step, stiffness) of its line.
+    missing : sequence of str
+        Sentences on the methods without a limit, for the foot of the figure.
+    """
     from matplotlib.colors import LogNorm
 
     labels = list(dict.fromkeys(r.label for r in all_rows if r.energy_error is not None and r.dt is not None))
@@ -438,7 +494,9 @@ def stability_map(all_rows: Sequence[Row], limits: Mapping[str, Any], missing: S
 # sections ---------------------------------------------------------------------------------------------------------
 
 
-def section_figure(points: np.ndarray, trajectory: np.ndarray, n_trajectories: int, axes: Any, heading: str) -> Figure:
+def section_figure(
+    points: np.ndarray, trajectory: np.ndarray, n_trajectories: int, axes: tuple[str, str], heading: str
+) -> Figure:
     """Points (n, 2) of a section, each trajectory in a shade of its own."""
     figure = new_figure(4.6, 4.4)
     ax = figure.add_subplot()

@@ -139,7 +139,16 @@ FINE = 1.05 ** np.arange(-150, 280)
 
 
 def states_of_energy(system: HamiltonianSystem, energy: float, n: int, plane: Plane, seed: int = 0) -> np.ndarray:
-    """n states (n, 2d) on a plane with H = energy, which cross it in its direction; a ValueError if none is found."""
+    """Return n states (n, 2d) on a plane with H = energy, which cross it in its direction.
+
+    They lie on rays from the lowest of a few states on the plane, within the first place where the energy is reached;
+    the coordinate that is conjugate to that of the plane then makes up for the rest of the energy.
+
+    Raises
+    ------
+    ValueError
+        If the system is driven, or no state of this energy is found.
+    """
     system.check_autonomous("so no `energy` is that of an orbit", "pass `y0`")
     checked_number("energy", energy, "a finite number, a value of H")
     check_counts(n=n)
@@ -212,12 +221,22 @@ def _checked_period(system: HamiltonianSystem, period: float | None, plane: list
 
 def _section(orbits: Orbits, seen: Crossings, where: Plane | float) -> PoincareSection:
     """The result, by the plane or by the period."""
-    plane: Any = (None, None, None)
-    if isinstance(where, Plane):
-        plane = (where.coordinate, where.level, where.direction)
-    status, period = seen.status if orbits.batch else int(seen.status[0]), where if isinstance(where, float) else None
-    found: Any = (seen.trajectory, seen.t, seen.states, status, seen.message, period)
-    return PoincareSection(orbits.system, orbits.integrator, orbits.t_span, orbits.rows, *plane, *found)
+    plane = where if isinstance(where, Plane) else None
+    return PoincareSection(
+        orbits.system,
+        orbits.integrator,
+        orbits.t_span,
+        orbits.rows,
+        None if plane is None else plane.coordinate,
+        None if plane is None else plane.level,
+        None if plane is None else plane.direction,
+        seen.trajectory,
+        seen.t,
+        seen.states,
+        seen.status if orbits.batch else int(seen.status[0]),
+        seen.message,
+        where if isinstance(where, float) else None,
+    )
 
 
 @dataclass(frozen=True, repr=False)

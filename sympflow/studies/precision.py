@@ -185,33 +185,35 @@ class Conditions:
         return measure_of(self.system)
 
     def run(self, integrator: Any, t_span: tuple[float, float] | None = None, t: np.ndarray | None = None) -> Solution:
-        """The solution from all initial states, or of a method that takes them one by one from a few."""
+        """The solution from all initial states, or of a method that takes them one by one from a few.
+
+        Over another interval if that is given.
+        """
         y0 = self.y0[:SAMPLE] if integrator.one_by_one and self.trajectories > SAMPLE else self.y0
         times = self.t if t is None else t
         return solve(self.system, integrator, t_span or self.t_span, y0, t_eval=times, backend=self.backend)
 
 
 def _measure(
-    conditions: Conditions, swept: Sequence[Any], repeats: int, budget: float, say: Callable[[str], None]
+    conditions: Conditions,
+    swept: list[tuple[Candidate, list[Any]]],
+    repeats: int,
+    budget: float,
+    say: Callable[[str], None],
 ) -> tuple[list[Row], Reference | None]:
     """All points for one set of initial states."""
     scene = f"{conditions.system.name}, {conditions.trajectories} trajectories"
     say(f"{scene}: reference")
-    truth, problem = None, ""
-    try:
-        truth = compute_reference(conditions.system, conditions.t_span, conditions.y0, conditions.t)
-    except (ValueError, RuntimeError) as why:
-        problem = str(why)
+    truth, problem = _reference(conditions)
     resolved = MARGIN * (0.0 if truth is None or truth.accuracy is None else truth.accuracy)
     floor = FLOOR if conditions.measure in _KEPT else max(FLOOR, resolved)
     points: list[Attempt] = []
     for candidate, integrators in swept:
         say(f"{scene}: {candidate.label}")
         error = math.inf
-        last = Attempt(replace(candidate, integrator=integrators[-1]), Row("", "", ""))
-        last.warm_up(conditions.run, conditions.t, conditions.t_span[0], conditions.system.dt)
+        compile_time = _compiled(replace(candidate, integrator=integrators[-1]), conditions)
         for integrator in integrators:
-            point = _first(replace(candidate, integrator=integrator), conditions, last.row.compile_time)
+            point = _first(replace(candidate, integrator=integrator), conditions, compile_time)
             points.append(point)
             if truth is None:
                 point.note(f"No error: {problem}")
@@ -223,24 +225,43 @@ def _measure(
                 break
     say(f"{scene}: timing")
     again = [p for p in points if p.row.status == "ok" and (p.row.run_time or 0.0) * repeats <= budget]
-    timed = interleaved([partial(conditions.run, p.candidate.integrator) for p in again], repeats)
-    for point, run_time in zip(again, timed, strict=True):
+    times = interleaved([partial(conditions.run, p.candidate.integrator) for p in again], repeats)
+    for point, run_time in zip(again, times, strict=True):
         point.fill(run_time=run_time.median, run_time_spread=run_time.spread, repeats=repeats)
     for point in points:
         if point.sol is not None and (few := point.sol.y0.size // point.sol.y0.shape[-1]) < conditions.trajectories:
-            times = {name: getattr(point.row, name) for name in ("run_time", "run_time_spread")}
-            share = conditions.trajectories / few
-            point.fill(**{name: None if x is None else x * share for name, x in times.items()})
-            point.note(f"Timed on {few} trajectories, which the method takes one by one.")
+            _scale(point, few, conditions.trajectories)
         if point.row.status == "ok" and truth is not None and not (point.row.error or 0.0) >= resolved:
             point.fill(status="uncertain")
     return [point.row for point in points], truth
 
 
+def _reference(conditions: Conditions) -> tuple[Reference | None, str]:
+    """The reference; None and the reason where there is none."""
+    try:
+        return compute_reference(conditions.system, conditions.t_span, conditions.y0, conditions.t), ""
+    except (ValueError, RuntimeError) as problem:
+        return None, str(problem)
+
+
+def _compiled(candidate: Candidate, conditions: Conditions) -> float | None:
+    """Compile all that the points of a method run; the seconds that it took, None if it does not run."""
+    point = Attempt(candidate, Row(conditions.system.name, candidate.method, candidate.label))
+    point.warm_up(conditions.run, conditions.t, conditions.t_span[0], conditions.system.dt)
+    return point.row.compile_time
+
+
+def _scale(point: Attempt, few: int, all_of_them: int) -> None:
+    """Scale the run time of a few trajectories to all of them."""
+    times = {"run_time": point.row.run_time, "run_time_spread": point.row.run_time_spread}
+    point.fill(**{name: None if x is None else x * (all_of_them / few) for name, x in times.items()})
+    point.note(f"Timed on {few} trajectories, which the method takes one by one.")
+
+
 def _first(candidate: Candidate, conditions: Conditions, compile_time: float | None) -> Attempt:
     """The first run of a point."""
-    more: dict[str, Any] = {"trajectories": conditions.trajectories, "compile_time": compile_time}
-    point = Attempt(candidate, Row(conditions.system.name, candidate.method, candidate.label, **more))
+    row = Row(conditions.system.name, candidate.method, candidate.label, trajectories=conditions.trajectories)
+    point = Attempt(candidate, replace(row, compile_time=compile_time))
     point.run(conditions.run)
     if (sol := point.sol) is None:
         return point
@@ -287,7 +308,11 @@ def _figure(point: Row, measure: str) -> float:
 
 
 def cost_at(points: Sequence[Row], error: float, cost: str = "run_time", measure: str = "energy_error") -> float:
-    """The cost of one method for an error, by interpolation of the logarithms; inf if no point is accurate enough."""
+    """Return the cost of one method for an error: between two of its points by interpolation of the logarithms.
+
+    The cheapest point that is more accurate is taken where that costs less; inf if no point is accurate enough. A step
+    or a tolerance is the largest that reaches the error.
+    """
     known = [(getattr(p, measure), getattr(p, cost)) for p in points]
     known = sorted((e, c) for e, c in known if e and c and math.isfinite(e))
     best = max if cost in SETTINGS else min

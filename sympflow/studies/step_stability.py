@@ -334,7 +334,10 @@ class Study:
         return ("stable", "") if worst <= 1 else ("bounded", f"The energy error is bounded, but reaches {worst:.3g}.")
 
     def stable(self, h: float) -> tuple[bool, float]:
-        """Tell whether all runs with this step stay below the bound and in a flow's domain, and their largest error."""
+        """Tell whether all runs with this step stay below the bound and in a flow's domain, and their largest error.
+
+        Most unstable steps show in the first `min_steps` of them.
+        """
         self.say(f"longest stable step: dt = {h:.6g}")
         t0, t1 = span = self.span(h)
         if abs(t1 - t0) > 4 * h * self.min_steps:
@@ -420,7 +423,18 @@ MEASURES: dict[str, Metric] = {
 
 @dataclass(frozen=True)
 class BlowUp:
-    """The end of a run that could not go on, and the factor by which ‖y‖ grew with each of its last steps."""
+    """The end of a run that could not go on.
+
+    Attributes
+    ----------
+    time : float
+        Of the singularity, as `solve` estimates it; or of the last finite state, where there is none.
+    singular : bool
+        True if the solution itself becomes infinite.
+    growth : float or None
+        Else the factor by which ‖y‖ grew with each step, the median over the last steps before the overflow; None for
+        an adaptive method, whose steps differ.
+    """
 
     time: float
     singular: bool
@@ -508,7 +522,16 @@ def step_limit(study: Study, rows: Sequence[Row]) -> StepLimit:
 
 @dataclass
 class Search:
-    """The search for the first step that is unstable."""
+    """The search for the first step that is unstable.
+
+    Attributes
+    ----------
+    study : Study
+    bad : list of float
+        Steps that are known to be unstable.
+    found : dict
+        What was found, stable or not, for each step that was tried.
+    """
 
     study: Study
     bad: list[float]
@@ -728,7 +751,9 @@ class StabilityReport(Report):
         if kind != "map":
             raise ValueError(f"`kind` must be 'steps' or 'map'; got {kind!r}.")
         if len({row.value for row in self.rows}) < 2:
-            raise ValueError("`kind` 'map' needs several systems that differ in a parameter: pass a family.")
+            raise ValueError(
+                "`kind` 'map' needs several systems that differ in a parameter: pass a family to stability()."
+            )
         lines: dict[str, list[tuple[float, float]]] = {}
         for x in self.limits:
             if x.stable is not None and x.unstable and x.value is not None:

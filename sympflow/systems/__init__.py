@@ -121,7 +121,9 @@ def register(name: str, factory: Callable[..., HamiltonianSystem]) -> None:
             "another name."
         )
     if isinstance(factory, HamiltonianSystem) or not _makes_a_default(factory):
-        raise TypeError(f"`factory` must be a function that makes the system without arguments; got {factory!r}.")
+        raise TypeError(
+            f"`factory` must be a function that makes the system, with a default for every parameter; got {factory!r}."
+        )
     _registered[key] = factory
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 
@@ -39,10 +38,14 @@ def kepler(e: float = 0.6) -> HamiltonianSystem:
     """
     checked_number("e", e, "an eccentricity, 0 ≤ e < 1", lambda x: 0 <= x < 1)
     period = 2 * math.pi
-    domain = _shell(e) if e <= _WIDEST else Tube(kepler_ellipse(e, np.linspace(0, period, 1025)), 0.05 * (1 - e))
-    y0, H = [1 - e, 0.0, 0.0, math.sqrt((1 + e) / (1 - e))], "(p1**2 + p2**2)/2 - 1/sqrt(q1**2 + q2**2)"
-    scene: dict[str, Any] = {"domain": domain, "y0": y0, "t_span": (0.0, 100 * period), "dt": period / 1000}
-    return HamiltonianSystem.from_sympy(H, name="kepler", **scene)
+    return HamiltonianSystem.from_sympy(
+        "(p1**2 + p2**2)/2 - 1/sqrt(q1**2 + q2**2)",
+        name="kepler",
+        domain=_shell(e) if e <= _WIDEST else Tube(kepler_ellipse(e, np.linspace(0, period, 1025)), 0.05 * (1 - e)),
+        y0=[1 - e, 0.0, 0.0, math.sqrt((1 + e) / (1 - e))],
+        t_span=(0.0, 100 * period),
+        dt=period / 1000,
+    )
 
 
 def kepler_ellipse(e: float, anomaly: np.ndarray) -> np.ndarray:
@@ -80,12 +83,22 @@ def decaying_orbit(drag: float = 0.002, e: float = 0.3) -> DoubledSystem:
     """
     checked_number("drag", drag, "positive, at most 0.003", lambda x: 0 < x <= 0.003)
     checked_number("e", e, "an eccentricity, 0 ≤ e ≤ 0.6", lambda x: 0 <= x <= 0.6)
-    orbit, p = kepler(e), 1.25 * math.sqrt((1 + e) / (1 - e))
+    orbit = kepler(e)
+    p = 1.25 * math.sqrt((1 + e) / (1 - e))
     high = np.array([1.2 * (1 + e), 1.2 * (1 + e), 0.1, 0.1, 0.1, 0.1, p, p])
-    scene: dict[str, Any] = {"y0": orbit.y0, "t_span": (0.0, 10 * math.pi), "dt": 2 * math.pi / 500}
-    free = HamiltonianSystem.from_sympy(orbit.symbols.H, name="kepler", **scene)
-    forces = ["-k*p1/(q1**2 + q2**2)", "-k*p2/(q1**2 + q2**2)"]
-    return doubled(free, forces, params={"k": drag}, domain=Box(-high, high), name="decaying_orbit")
+    return doubled(
+        HamiltonianSystem.from_sympy(
+            orbit.symbols.H,
+            name="kepler",
+            y0=orbit.y0,
+            t_span=(0.0, 10 * math.pi),
+            dt=2 * math.pi / 500,
+        ),
+        ["-k*p1/(q1**2 + q2**2)", "-k*p2/(q1**2 + q2**2)"],
+        params={"k": drag},
+        domain=Box(-high, high),
+        name="decaying_orbit",
+    )
 
 
 def _shell(e: float) -> Domain:
@@ -128,12 +141,21 @@ def schwarzschild(semilatus: float = 12.0, e: float = 0.5) -> HamiltonianSystem:
     E2 = ((semilatus - 2) ** 2 - 4 * e * e) / (semilatus * (semilatus - 3 - e * e))
     period = 2 * math.pi * (semilatus / (1 - e * e)) ** 1.5
     inner, outer = semilatus / (1 + e), semilatus / (1 - e)
-    widest, p_r = 21 * perihelion_angle(semilatus, e), 2 * (e + 0.1) / math.sqrt(semilatus - 6 - 2 * e)
-    H, near = "((1 - 2/q1)*p1**2 + p2**2/q1**2 - E2/(1 - 2/q1))/2", 0.01 / semilatus
-    box = Box([0.98 * inner, -1.0, -p_r, 0.99 * L], [1.02 * outer, widest, p_r, 1.01 * L])
-    scene: dict[str, Any] = {"domain": EnergySublevel(-0.5 + near, box, above=-0.5 - near), "dt": period / 500}
-    scene |= {"y0": [inner, 0.0, 0.0, L], "t_span": (0.0, 20 * period)}
-    return HamiltonianSystem.from_sympy(H, params={"E2": E2}, name="schwarzschild", **scene)
+    widest = 21 * perihelion_angle(semilatus, e)
+    p_r = 2 * (e + 0.1) / math.sqrt(semilatus - 6 - 2 * e)
+    return HamiltonianSystem.from_sympy(
+        "((1 - 2/q1)*p1**2 + p2**2/q1**2 - E2/(1 - 2/q1))/2",
+        params={"E2": E2},
+        name="schwarzschild",
+        domain=EnergySublevel(
+            -0.5 + 0.01 / semilatus,
+            Box([0.98 * inner, -1.0, -p_r, 0.99 * L], [1.02 * outer, widest, p_r, 1.01 * L]),
+            above=-0.5 - 0.01 / semilatus,
+        ),
+        y0=[inner, 0.0, 0.0, L],
+        t_span=(0.0, 20 * period),
+        dt=period / 500,
+    )
 
 
 def perihelion_angle(semilatus: float, e: float) -> float:
@@ -195,20 +217,28 @@ def three_body() -> HamiltonianSystem:
         f"{MASSES[i] * MASSES[j]}/sqrt((q{2 * i + 1} - q{2 * j + 1})**2 + (q{2 * i + 2} - q{2 * j + 2})**2)"
         for i, j in combinations(range(3), 2)
     )
-    high, y0 = np.repeat([25.0, 50.0], 6), [1.0, 3.0, -2.0, -1.0, 1.0, -1.0, *[0.0] * 6]
-    scene: dict[str, Any] = {"domain": Box(-high, high), "y0": y0, "t_span": (0.0, 70.0), "dt": 1e-4}
-    return HamiltonianSystem.from_sympy(f"{kinetic} - {attraction}", name="three_body", **scene)
+    high = [25.0] * 6 + [50.0] * 6
+    return HamiltonianSystem.from_sympy(
+        f"{kinetic} - {attraction}",
+        name="three_body",
+        domain=Box([-x for x in high], high),
+        y0=[1.0, 3.0, -2.0, -1.0, 1.0, -1.0, *[0.0] * 6],
+        t_span=(0.0, 70.0),
+        dt=1e-4,
+    )
 
 
-G = 2.95912208286e-4  # gravitational constant in AU³ per day² and solar mass
+G = 2.95912208286e-4
+"""Gravitational constant in AU³ per day² and solar mass."""
 
 BODIES = ("Sun", "Jupiter", "Saturn", "Uranus", "Neptune", "Pluto")
 
-PLANET_MASSES = np.array(  # in solar masses; the Sun's includes the inner planets
+PLANET_MASSES = np.array(
     [1.00000597682, 0.000954786104043, 0.000285583733151, 0.0000437273164546, 0.0000517759138449, 1 / 1.3e8]
 )
+"""In solar masses; the Sun's includes the inner planets."""
 
-POSITIONS = np.array(  # heliocentric, in astronomical units, on 5 September 1994 at 0 h
+POSITIONS = np.array(
     [
         [0.0, 0.0, 0.0],
         [-3.5023653, -3.8169847, -1.5507963],
@@ -218,8 +248,9 @@ POSITIONS = np.array(  # heliocentric, in astronomical units, on 5 September 199
         [-15.5387357, -25.2225594, -3.1902382],
     ]
 )
+"""Heliocentric, in astronomical units, on 5 September 1994 at 0 h."""
 
-VELOCITIES = np.array(  # heliocentric, in astronomical units per day
+VELOCITIES = np.array(
     [
         [0.0, 0.0, 0.0],
         [0.00565429, -0.00412490, -0.00190589],
@@ -229,6 +260,7 @@ VELOCITIES = np.array(  # heliocentric, in astronomical units per day
         [0.00276725, -0.00170702, -0.00136504],
     ]
 )
+"""Heliocentric, in astronomical units per day."""
 
 _PERIOD = 90_600.0  # of Pluto, in days: the longest
 _THICKNESS = 0.2  # of the tube, relative to each planet's distance and speed
@@ -257,9 +289,16 @@ def outer_solar_system() -> HamiltonianSystem:
     """
     q, v = (x - PLANET_MASSES @ x / PLANET_MASSES.sum() for x in (POSITIONS, VELOCITIES))
     y0 = np.concatenate([q.ravel(), (PLANET_MASSES[:, None] * v).ravel()])
-    scene: dict[str, Any] = {"domain": _tube(q, v), "y0": y0, "t_span": (0.0, 200_000.0), "dt": 50.0}
-    scene |= {"masses": PLANET_MASSES, "params": {"G": G}}
-    return HamiltonianSystem.pairs("-G*m1*m2/r", name="outer_solar_system", **scene)
+    return HamiltonianSystem.pairs(
+        "-G*m1*m2/r",
+        masses=PLANET_MASSES,
+        params={"G": G},
+        name="outer_solar_system",
+        domain=_tube(q, v),
+        y0=y0,
+        t_span=(0.0, 200_000.0),
+        dt=50.0,
+    )
 
 
 def _tube(q: np.ndarray, v: np.ndarray) -> Tube:

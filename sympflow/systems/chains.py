@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 
@@ -48,12 +47,19 @@ def fput(omega: float = 50.0, m: int = 3) -> HamiltonianSystem:
     soft = [f"({slow[0]} - {fast[0]})**4", f"({slow[-1]} + {fast[-1]})**4"]
     soft += [f"({slow[i + 1]} - {fast[i + 1]} - {slow[i]} - {fast[i]})**4" for i in range(m - 1)]
     kinetic = " + ".join(f"p{i}**2" for i in range(1, 2 * m + 1))
-    stiff, y0 = " + ".join(f"{q}**2" for q in fast), np.zeros(4 * m)
+    stiff = " + ".join(f"{q}**2" for q in fast)
+    y0 = np.zeros(4 * m)
     y0[[0, m, 2 * m, 3 * m]] = 1.0, 1 / omega, 1.0, 1.0
     high = np.repeat([1.7, 1.7 / omega, 1.7, 1.7], m)
-    H = f"({kinetic})/2 + omega**2*({stiff})/2 + ({' + '.join(soft)})/4"
-    scene: dict[str, Any] = {"domain": Box(-high, high), "y0": y0, "t_span": (0.0, 200.0), "dt": 0.05 / omega}
-    return HamiltonianSystem.from_sympy(H, params={"omega": omega}, name="fput", **scene)
+    return HamiltonianSystem.from_sympy(
+        f"({kinetic})/2 + omega**2*({stiff})/2 + ({' + '.join(soft)})/4",
+        params={"omega": omega},
+        name="fput",
+        domain=Box(-high, high),
+        y0=y0,
+        t_span=(0.0, 200.0),
+        dt=0.05 / omega,
+    )
 
 
 def oscillatory_energies(system: HamiltonianSystem, y: Array) -> Array:
@@ -103,7 +109,11 @@ def toda_lattice(n: int = 3) -> HamiltonianSystem:
     y0 = np.zeros(2 * n)
     y0[n], y0[n + 1 :] = 1.0, -1 / (n - 1)
     return HamiltonianSystem.from_sympy(
-        f"({kinetic})/2 + {springs} - {n}", name="toda_lattice", domain=Ball(np.zeros(2 * n), 2.0), y0=y0, dt=0.05
+        f"({kinetic})/2 + {springs} - {n}",
+        name="toda_lattice",
+        domain=Ball(np.zeros(2 * n), 2.0),
+        y0=y0,
+        dt=0.05,
     )
 
 
@@ -113,25 +123,30 @@ def lax_eigenvalues(y: Array) -> np.ndarray:
     L has p_i/2 on the diagonal and exp((q_i − q_{i+1})/2)/2 beside it and in the corners. An orbit keeps them.
     """
     q, p = np.split(to_numpy(y), 2, axis=-1)
-    n, a = q.shape[-1], np.exp((q - np.roll(q, -1, axis=-1)) / 2) / 2
+    n = q.shape[-1]
+    a = np.exp((q - np.roll(q, -1, axis=-1)) / 2) / 2
     to_next = a[..., None] * np.roll(np.eye(n), 1, axis=1)
     return np.linalg.eigvalsh(p[..., None] / 2 * np.eye(n) + to_next + to_next.swapaxes(-1, -2))
 
 
-EPSILON = 119.8  # depth of the potential in kelvin (times Boltzmann's constant)
+EPSILON = 119.8
+"""Depth of the potential in kelvin (times Boltzmann's constant)."""
 
-SIGMA = 0.341  # distance at which the potential is zero, in nanometres
+SIGMA = 0.341
+"""Distance at which the potential is zero, in nanometres."""
 
 MASS = 66.34e-27 / 1.380658e-23
 """The mass of an atom, in K·ns²/nm²: kilograms over Boltzmann's constant, 1 nm/ns being 1 m/s."""
 
-POSITIONS = np.array(  # in nanometres: one atom in the middle, six around it
+POSITIONS = np.array(
     [[0.0, 0.0], [0.02, 0.39], [0.34, 0.17], [0.36, -0.21], [-0.02, -0.40], [-0.35, -0.16], [-0.31, 0.21]]
 )
+"""In nanometres: one atom in the middle, six around it."""
 
-VELOCITIES = np.array(  # in nanometres per nanosecond
+VELOCITIES = np.array(
     [[-30.0, -20.0], [50.0, -90.0], [-70.0, -60.0], [90.0, 40.0], [80.0, 90.0], [-40.0, 100.0], [-80.0, -60.0]]
 )
+"""In nanometres per nanosecond."""
 
 
 def lennard_jones() -> HamiltonianSystem:
@@ -155,7 +170,14 @@ def lennard_jones() -> HamiltonianSystem:
     """
     y0 = np.concatenate([POSITIONS.ravel(), MASS * VELOCITIES.ravel()])
     rest = np.concatenate([POSITIONS.ravel(), np.zeros(14)])
-    V, params = "4*epsilon*((sigma/r)**12 - (sigma/r)**6)", {"epsilon": EPSILON, "sigma": SIGMA}
-    domain = Tube([rest, rest], np.repeat([0.15, 3.5], 14))
-    scene: dict[str, Any] = {"name": "lennard_jones", "domain": domain, "y0": y0, "t_span": (0.0, 0.2), "dt": 4e-5}
-    return HamiltonianSystem.pairs(V, masses=np.full(7, MASS), dim=2, params=params, **scene)
+    return HamiltonianSystem.pairs(
+        "4*epsilon*((sigma/r)**12 - (sigma/r)**6)",
+        masses=np.full(7, MASS),
+        dim=2,
+        params={"epsilon": EPSILON, "sigma": SIGMA},
+        name="lennard_jones",
+        domain=Tube([rest, rest], np.repeat([0.15, 3.5], 14)),
+        y0=y0,
+        t_span=(0.0, 0.2),
+        dt=4e-5,
+    )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from fractions import Fraction
-from typing import Any
 
 import numpy as np
 
@@ -38,9 +37,16 @@ def driven_pendulum(amplitude: float = 0.3, frequency: float = 2.7) -> Hamiltoni
     .. [1] L. D. Landau, E. M. Lifshitz, "Mechanics", 3rd ed., Pergamon 1976, § 27 and § 30.
     """
     period = 2 * math.pi / _positive("frequency", frequency)
-    params: dict[str, Any] = {"a": _positive("amplitude", amplitude), "w": frequency}
-    scene: dict[str, Any] = {"domain": Box([-2.0, -1.6], [2.0, 1.6]), "y0": [1.0, 0.0], "dt": _dividing(period, 0.05)}
-    return _driven("driven_pendulum", "p**2/2 - (1 + a*cos(w*t))*cos(q)", params, period, **scene)
+    return HamiltonianSystem.from_sympy(
+        "p**2/2 - (1 + a*cos(w*t))*cos(q)",
+        params={"a": _positive("amplitude", amplitude), "w": frequency},
+        time="t",
+        period=period,
+        name="driven_pendulum",
+        domain=Box([-2.0, -1.6], [2.0, 1.6]),
+        y0=[1.0, 0.0],
+        dt=_dividing(period, 0.05),
+    )
 
 
 def paul_trap(a: float = 0.0, q: float = 0.4) -> HamiltonianSystem:
@@ -67,10 +73,17 @@ def paul_trap(a: float = 0.0, q: float = 0.4) -> HamiltonianSystem:
     .. [1] W. Paul, "Electromagnetic traps for charged and neutral particles", Rev. Mod. Phys. 62 (1990) 531–540.
     .. [2] NIST Digital Library of Mathematical Functions, chapter 28, https://dlmf.nist.gov/28.
     """
-    H = "(p1**2 + p2**2)/2 + (a - 2*drive*cos(2*t))*(q1**2 - q2**2)/2"
-    params: dict[str, Any] = {"a": checked_number("a", a), "drive": _not_zero("q", q)}
-    scene: dict[str, Any] = {"domain": Box([-2.0] * 4, [2.0] * 4), "y0": [1.0, 0.5, 0.0, 0.0], "dt": math.pi / 64}
-    return _driven("paul_trap", H, params, math.pi, **scene, energy_scale=1.0)
+    return HamiltonianSystem.from_sympy(
+        "(p1**2 + p2**2)/2 + (a - 2*drive*cos(2*t))*(q1**2 - q2**2)/2",
+        params={"a": checked_number("a", a), "drive": _not_zero("q", q)},
+        time="t",
+        period=math.pi,
+        name="paul_trap",
+        domain=Box([-2.0] * 4, [2.0] * 4),
+        y0=[1.0, 0.5, 0.0, 0.0],
+        dt=math.pi / 64,
+        energy_scale=1.0,
+    )
 
 
 def duffing(
@@ -102,12 +115,23 @@ def duffing(
        Springer 1983, 2.2.
     """
     period = 2 * math.pi / _positive("frequency", frequency)
-    params: dict[str, Any] = {"alpha": checked_number("alpha", alpha), "beta": _positive("beta", beta)}
-    params |= {"F": _not_zero("force", force), "w": frequency}
-    rate, H = checked_number("damping", damping, NOT_NEGATIVE, not_negative), "p**2/2 + alpha*q**2/2 + beta*q**4/4"
-    scene: dict[str, Any] = {"domain": Box([-1.8, -1.3], [1.8, 1.3]), "y0": [1.0, 0.0], "energy_scale": 1.0}
-    dt = _dividing(period, 0.05)
-    return _driven("duffing", f"{H} - F*q*cos(w*t)", params, period, damping=rate, dt=dt, **scene)
+    return HamiltonianSystem.from_sympy(
+        "p**2/2 + alpha*q**2/2 + beta*q**4/4 - F*q*cos(w*t)",
+        params={
+            "alpha": checked_number("alpha", alpha),
+            "beta": _positive("beta", beta),
+            "F": _not_zero("force", force),
+            "w": frequency,
+        },
+        time="t",
+        period=period,
+        damping=checked_number("damping", damping, NOT_NEGATIVE, not_negative),
+        name="duffing",
+        domain=Box([-1.8, -1.3], [1.8, 1.3]),
+        y0=[1.0, 0.0],
+        dt=_dividing(period, 0.05),
+        energy_scale=1.0,
+    )
 
 
 def fodo_cell(strength: float = 0.8, quadrupole: float = 0.5, drift: float = 2.0) -> HamiltonianSystem:
@@ -154,13 +178,22 @@ def fodo_cell(strength: float = 0.8, quadrupole: float = 0.5, drift: float = 2.0
     step /= math.ceil(step / (cell / 40))
     ends = np.cumsum([0, half, between, 2 * half, between, half]).astype(float)
     lattice = PPoly(np.array([[1.0, 0.0, -1.0, 0.0, 1.0]]), ends, extrapolate="periodic")
-    params: dict[str, Any] = {"k": _positive("strength", strength), "lattice": lattice}
-    scene: dict[str, Any] = {"domain": Box([-2.0] * 4, [2.0] * 4), "y0": [1.0, 1.0, 0.0, 0.0], "energy_scale": 1.0}
-    scene |= {"t_span": (0.0, 20 * float(cell)), "dt": float(step)}
-    return _driven("fodo_cell", "(p1**2 + p2**2)/2 + k*lattice*(q1**2 - q2**2)/2", params, float(cell), **scene)
+    return HamiltonianSystem.from_sympy(
+        "(p1**2 + p2**2)/2 + k*lattice*(q1**2 - q2**2)/2",
+        params={"k": _positive("strength", strength), "lattice": lattice},
+        time="t",
+        period=float(cell),
+        name="fodo_cell",
+        domain=Box([-2.0] * 4, [2.0] * 4),
+        y0=[1.0, 1.0, 0.0, 0.0],
+        t_span=(0.0, 20 * float(cell)),
+        dt=float(step),
+        energy_scale=1.0,
+    )
 
 
-MOST_PIECES = 1000  # steps of a cell beyond which the lengths in it have no step in common
+MOST_PIECES = 1000
+"""Steps of a cell beyond which the lengths in it have no step in common."""
 
 
 def fodo_matrices(strength: float = 0.8, quadrupole: float = 0.5, drift: float = 2.0) -> np.ndarray:
@@ -221,13 +254,16 @@ def kicked(K: float = 0.97, modes: int = 3) -> HamiltonianSystem:
     """
     modes = checked_count("modes", modes, 1, 100, "a whole number from 1 to 100")
     waves = " + ".join(f"cos({2 * n}*pi*t)" for n in range(1, modes + 1))
-    H, params = f"p**2/2 + K*cos(q)*(1 + 2*({waves}))", {"K": _not_zero("K", K)}
-    domain = Box([0.0, -math.pi], [2 * math.pi, math.pi])
-    return _driven("kicked", H, params, 1.0, domain=domain, y0=[2.0, 0.0], dt=1 / (2 * modes + 1))
-
-
-def _driven(name: str, H: str, params: dict[str, Any], period: float, **scene: Any) -> HamiltonianSystem:
-    return HamiltonianSystem.from_sympy(H, params=params, time="t", period=period, name=name, **scene)
+    return HamiltonianSystem.from_sympy(
+        f"p**2/2 + K*cos(q)*(1 + 2*({waves}))",
+        params={"K": _not_zero("K", K)},
+        time="t",
+        period=1.0,
+        name="kicked",
+        domain=Box([0.0, -math.pi], [2 * math.pi, math.pi]),
+        y0=[2.0, 0.0],
+        dt=1 / (2 * modes + 1),
+    )
 
 
 def _dividing(period: float, longest: float) -> float:
@@ -237,7 +273,9 @@ def _dividing(period: float, longest: float) -> float:
 
 def _not_zero(name: str, value: float) -> float:
     if checked_number(name, value) == 0:
-        raise ValueError(f"`{name}` must not be 0, for H would not depend on t: define it by from_sympy, without time.")
+        raise ValueError(
+            f"`{name}` must not be 0, for H would not depend on t: define it with from_sympy, without time."
+        )
     return value
 
 

@@ -21,7 +21,10 @@ NAME = re.compile(r"[A-Za-z][A-Za-z0-9]*([-_][A-Za-z0-9]+)*")
 
 
 def given_system(system: Any, params: Mapping[str, Any] | None = None) -> HamiltonianSystem:
-    """The system that an argument means: one, the name of a scene, or H, the first values of `params` its symbols'."""
+    """Return the system that an argument means: one, the name of a scene, or H as `from_sympy` takes it.
+
+    The first values of `params` are those of the symbols of H.
+    """
     if isinstance(system, HamiltonianSystem):
         return system
     if isinstance(system, str):
@@ -33,9 +36,11 @@ def given_system(system: Any, params: Mapping[str, Any] | None = None) -> Hamilt
                 return get(key)()
             hint = did_you_mean(key, available(), 0.5)
             names = (
-                "" if hint else f" There are {', '.join(available())}; a formula such as 'p**2/2 + q**2/2' is one too."
+                ""
+                if hint
+                else f" There are {', '.join(available())}; a formula such as 'p**2/2 + q**2/2' is a system too."
             )
-            raise ValueError(f"`system` {system!r} is the name of no scene.{hint}{names}")
+            raise ValueError(f"`system` {system!r} is not the name of a scene.{hint}{names}")
         return HamiltonianSystem.from_sympy(system, params=_first(params))
     sympy = sys.modules.get("sympy")
     if sympy is not None and isinstance(system, sympy.Basic | sympy.MatrixBase):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 from sympflow.arguments import NOT_NEGATIVE, check_one_of, check_positive, checked_number, not_negative
 from sympflow.arrays import Array
@@ -51,11 +50,17 @@ def damped_oscillator(omega: float = 1.0, damping: float = 0.1) -> HamiltonianSy
 
 def _oscillator(name: str, omega: float, damping: float = 0.0) -> HamiltonianSystem:
     checked_number("omega", omega, "positive and finite, from 1e-100 to 1e100", lambda x: 1e-100 <= x <= 1e100)
-    H, high = "(p**2 + omega**2*q**2)/2", [1.7, 1.7 * omega]
-    scene: dict[str, Any] = {"domain": EnergySublevel(high[1] ** 2 / 2, Box([-x for x in high], high))}
-    scene |= {"y0": [1.0, 0.0], "t_span": (0.0, 100.0 / omega), "dt": 0.05 / omega}
-    damping = checked_number("damping", damping, NOT_NEGATIVE, not_negative)
-    return HamiltonianSystem.from_sympy(H, params={"omega": omega}, damping=damping, name=name, **scene)
+    high = [1.7, 1.7 * omega]
+    return HamiltonianSystem.from_sympy(
+        "(p**2 + omega**2*q**2)/2",
+        params={"omega": omega},
+        damping=checked_number("damping", damping, NOT_NEGATIVE, not_negative),
+        name=name,
+        domain=EnergySublevel(high[1] ** 2 / 2, Box([-x for x in high], high)),
+        y0=[1.0, 0.0],
+        t_span=(0.0, 100.0 / omega),
+        dt=0.05 / omega,
+    )
 
 
 def damped_pendulum(damping: float = 0.1) -> HamiltonianSystem:
@@ -81,9 +86,14 @@ def damped_pendulum(damping: float = 0.1) -> HamiltonianSystem:
 def _pendulum(name: str, energy: float, y0: list[float], damping: float = 0.0) -> HamiltonianSystem:
     """A pendulum in the domain below an energy."""
     q, p = math.acos(max(1 - energy, -1.0)), math.sqrt(2 * energy)
-    rate = checked_number("damping", damping, NOT_NEGATIVE, not_negative)
-    H, domain = "p**2/2 + 1 - cos(q)", EnergySublevel(energy, Box([-q, -p], [q, p]))
-    return HamiltonianSystem.from_sympy(H, damping=rate, name=name, domain=domain, y0=y0, dt=0.05)
+    return HamiltonianSystem.from_sympy(
+        "p**2/2 + 1 - cos(q)",
+        damping=checked_number("damping", damping, NOT_NEGATIVE, not_negative),
+        name=name,
+        domain=EnergySublevel(energy, Box([-q, -p], [q, p])),
+        y0=y0,
+        dt=0.05,
+    )
 
 
 def pendulum() -> HamiltonianSystem:
@@ -133,9 +143,14 @@ def double_well(energy: float = 0.25) -> HamiltonianSystem:
     """
     check_positive("energy", energy)
     q, p = math.sqrt(1 + math.sqrt(2)), 1.0
-    H, domain = "p**2/2 + (q**2 - 1)**2/4", EnergySublevel(0.5, Box([-q, -p], [q, p]))
-    y0 = [math.sqrt(1 + 2 * math.sqrt(energy)), 0.0]
-    return HamiltonianSystem.from_sympy(H, name="double_well", domain=domain, y0=y0, dt=0.05, energy_scale=0.25)
+    return HamiltonianSystem.from_sympy(
+        "p**2/2 + (q**2 - 1)**2/4",
+        name="double_well",
+        domain=EnergySublevel(0.5, Box([-q, -p], [q, p])),
+        y0=[math.sqrt(1 + 2 * math.sqrt(energy)), 0.0],
+        dt=0.05,
+        energy_scale=0.25,
+    )
 
 
 def quartic() -> HamiltonianSystem:
@@ -151,9 +166,13 @@ def quartic() -> HamiltonianSystem:
     energy = 0.6
     q1 = math.sqrt(2 * (math.sqrt(0.04 + energy) - 0.2))  # q₁⁴/4 + q₁²/5 = 0.6
     q2, p = (4 * energy) ** 0.25, math.sqrt(2 * energy)
-    domain = EnergySublevel(energy, Box([-q1, -q2, -p, -p], [q1, q2, p, p]))
-    H, y0 = "(p1**2 + p2**2)/2 + (q1**4 + q2**4)/4 + 3*q1**2*q2**2/10 + q1**2/5", [0.8, 0.5, 0.3, -0.4]
-    return HamiltonianSystem.from_sympy(H, name="quartic", domain=domain, y0=y0, dt=0.05)
+    return HamiltonianSystem.from_sympy(
+        "(p1**2 + p2**2)/2 + (q1**4 + q2**4)/4 + 3*q1**2*q2**2/10 + q1**2/5",
+        name="quartic",
+        domain=EnergySublevel(energy, Box([-q1, -q2, -p, -p], [q1, q2, p, p])),
+        y0=[0.8, 0.5, 0.3, -0.4],
+        dt=0.05,
+    )
 
 
 def henon_heiles() -> HamiltonianSystem:
@@ -191,9 +210,13 @@ def henon_heiles_escape(energy: float = 0.245) -> HamiltonianSystem:
 
 def _scene(name: str, y0: list[float]) -> HamiltonianSystem:
     q1, p = math.sqrt(3) / 2, 1 / math.sqrt(3)
-    H = "(p1**2 + p2**2)/2 + (q1**2 + q2**2)/2 + q1**2*q2 - q2**3/3"
-    domain = EnergySublevel(1 / 6, Box([-q1, -0.5, -p, -p], [q1, 1.0, p, p]))
-    return HamiltonianSystem.from_sympy(H, name=name, domain=domain, y0=y0, dt=0.05)
+    return HamiltonianSystem.from_sympy(
+        "(p1**2 + p2**2)/2 + (q1**2 + q2**2)/2 + q1**2*q2 - q2**3/3",
+        name=name,
+        domain=EnergySublevel(1 / 6, Box([-q1, -0.5, -p, -p], [q1, 1.0, p, p])),
+        y0=y0,
+        dt=0.05,
+    )
 
 
 GRAVITY = 1.0
@@ -235,16 +258,24 @@ def spring_pendulum(k: float = 100.0, coordinates: str = "cartesian", radial_ene
     stretch = 2 * (speed / math.sqrt(k) + 3 * GRAVITY / k)  # at the bottom 2g(1 − cos 1) + g pull on the spring
     fast = 2 * (speed + 3 * GRAVITY / math.sqrt(k))
     if coordinates == "polar":
-        H, y0 = "p1**2/2 + k*(q1 - 1)**2/2 + p2**2/(2*q1**2) - g*q1*cos(q2)", [r, ANGLE, speed, 0.0]
+        expression = "p1**2/2 + k*(q1 - 1)**2/2 + p2**2/(2*q1**2) - g*q1*cos(q2)"
+        y0 = [r, ANGLE, speed, 0.0]
         low, high = [max(1 - stretch, 0.1), -1.4, -fast, -1.5], [1 + stretch, 1.4, fast, 1.5]
     else:
-        H = "(p1**2 + p2**2)/2 + k*(sqrt(q1**2 + q2**2) - 1)**2/2 + g*q2"
+        expression = "(p1**2 + p2**2)/2 + k*(sqrt(q1**2 + q2**2) - 1)**2/2 + g*q2"
         y0 = [r * s, -r * c, speed * s, -speed * c]
         reach, p = 1 + stretch, 1.5 + fast
         low, high = [-reach, -reach, -p, -p], [reach, 0.1, p, p]
-    scene: dict[str, Any] = {"domain": Box(low, high), "y0": y0, "t_span": (0.0, 20.0), "name": "spring_pendulum"}
-    scene |= {"dt": 0.1 / math.sqrt(k), "energy_scale": GRAVITY}
-    return HamiltonianSystem.from_sympy(H, params={"k": k, "g": GRAVITY}, **scene)
+    return HamiltonianSystem.from_sympy(
+        expression,
+        params={"k": k, "g": GRAVITY},
+        name="spring_pendulum",
+        domain=Box(low, high),
+        y0=y0,
+        t_span=(0.0, 20.0),
+        dt=0.1 / math.sqrt(k),
+        energy_scale=GRAVITY,
+    )
 
 
 def nonseparable(amplitude: float = 3.0) -> HamiltonianSystem:
@@ -267,9 +298,13 @@ def nonseparable(amplitude: float = 3.0) -> HamiltonianSystem:
     """
     check_positive("amplitude", amplitude)
     widest = 1.1 * amplitude  # of q and of p
-    domain = EnergySublevel((1 + widest**2) / 2, Box([-widest] * 2, [widest] * 2))
-    H, y0, dt = "(q**2 + 1)*(p**2 + 1)/2", [-amplitude, 0.0], 0.05 / math.sqrt(1 + amplitude**2)
-    return HamiltonianSystem.from_sympy(H, name="nonseparable", domain=domain, y0=y0, dt=dt)
+    return HamiltonianSystem.from_sympy(
+        "(q**2 + 1)*(p**2 + 1)/2",
+        name="nonseparable",
+        domain=EnergySublevel((1 + widest**2) / 2, Box([-widest] * 2, [widest] * 2)),
+        y0=[-amplitude, 0.0],
+        dt=0.05 / math.sqrt(1 + amplitude**2),
+    )
 
 
 def double_pendulum() -> HamiltonianSystem:
@@ -287,9 +322,14 @@ def double_pendulum() -> HamiltonianSystem:
     ----------
     .. [1] L. D. Landau, E. M. Lifshitz, "Mechanics", 3rd ed., Butterworth–Heinemann 1976, § 5 and § 23.
     """
-    domain = EnergySublevel(-2.0, Box(low=[-1.1, -1.65, -2.1, -1.5], high=[1.1, 1.65, 2.1, 1.5]))
-    H = "(p1**2 + 2*p2**2 - 2*p1*p2*cos(q1 - q2))/(2*(1 + sin(q1 - q2)**2)) - 2*cos(q1) - cos(q2)"
-    return HamiltonianSystem.from_sympy(H, name="double_pendulum", domain=domain, y0=[0.6, 0.8, 0.0, 0.0], dt=0.05)
+    box = Box(low=[-1.1, -1.65, -2.1, -1.5], high=[1.1, 1.65, 2.1, 1.5])
+    return HamiltonianSystem.from_sympy(
+        "(p1**2 + 2*p2**2 - 2*p1*p2*cos(q1 - q2))/(2*(1 + sin(q1 - q2)**2)) - 2*cos(q1) - cos(q2)",
+        name="double_pendulum",
+        domain=EnergySublevel(-2.0, box),
+        y0=[0.6, 0.8, 0.0, 0.0],
+        dt=0.05,
+    )
 
 
 def charged_particle(field: float = 10.0) -> HamiltonianSystem:
@@ -322,10 +362,15 @@ def charged_particle(field: float = 10.0) -> HamiltonianSystem:
     p = math.sqrt(1.4)  # the speed in the domain
     across = p + field * (1 + length**2) * radius / 2
     high = [radius, radius, length, across, across, p]
-    H = "((p1 + B*(1 + q3**2)*q2/2)**2 + (p2 - B*(1 + q3**2)*q1/2)**2 + p3**2)/2"
-    scene: dict[str, Any] = {"domain": EnergySublevel(0.7, Box([-x for x in high], high)), "t_span": (0.0, 50.0)}
-    scene |= {"y0": [0.5, 0.0, 0.0, 0.0, 1 + field / 4, 0.5], "dt": 0.1 / field}
-    return HamiltonianSystem.from_sympy(H, params={"B": field}, name="charged_particle", **scene)
+    return HamiltonianSystem.from_sympy(
+        "((p1 + B*(1 + q3**2)*q2/2)**2 + (p2 - B*(1 + q3**2)*q1/2)**2 + p3**2)/2",
+        params={"B": field},
+        name="charged_particle",
+        domain=EnergySublevel(0.7, Box([-x for x in high], high)),
+        y0=[0.5, 0.0, 0.0, 0.0, 1 + field / 4, 0.5],
+        t_span=(0.0, 50.0),
+        dt=0.1 / field,
+    )
 
 
 def magnetic_moment(system: HamiltonianSystem, y: Array) -> Array:
@@ -343,5 +388,6 @@ def magnetic_moment(system: HamiltonianSystem, y: Array) -> Array:
     B, q1, q2, q3, v3 = system.params["B"], y[..., 0], y[..., 1], y[..., 2], y[..., 5]
     axial = B * (1 + q3**2)
     v1, v2 = y[..., 3] + axial * q2 / 2, y[..., 4] - axial * q1 / 2
-    strength2, along = axial**2 + (B * q3) ** 2 * (q1**2 + q2**2), axial * v3 - B * q3 * (q1 * v1 + q2 * v2)
+    strength2 = axial**2 + (B * q3) ** 2 * (q1**2 + q2**2)
+    along = axial * v3 - B * q3 * (q1 * v1 + q2 * v2)
     return (v1**2 + v2**2 + v3**2 - along**2 / strength2) / (2 * strength2**0.5)

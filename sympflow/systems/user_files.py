@@ -80,7 +80,11 @@ def from_toml(path: str | os.PathLike[str], **params: float) -> HamiltonianSyste
 
 
 def factory(path: str | os.PathLike[str], name: str | None = None) -> Callable[..., HamiltonianSystem]:
-    """The function that makes the system of a file, of a name in it if it is one of Python, which is run for it."""
+    """The function that makes the system of a file; its parameters are those of the system, with their defaults.
+
+    A .py file is run, as `python file.py` would, but for its ``__main__`` part; the name is that of a HamiltonianSystem
+    in it, or of a function that returns one, and may be left out where there is one only.
+    """
     file = Path(path)
     if file.suffix == ".toml":
         return _of_toml(file, name)

@@ -70,9 +70,17 @@ def wave_equation(n: int = 256, speed: float = 1.0, width: float = 0.5, accuracy
     """
     n, h = _sites(n, accuracy), 2 * math.pi / _sites(n, accuracy)
     c, w = _positive("speed", speed), _positive("width", width)
-    bond, high = {k: f"c**2*({V})" for k, V in STENCILS[accuracy].items()}, np.repeat([1.2, 1.2 * c / w], n)
-    scene: dict[str, Any] = {"params": {"c": c, "h": h}, "high": high, "t_end": 2 * math.pi / c, "dt": h / (2 * c)}
-    return _system("wave_equation", partial(_pulse, speed=c, width=w), _grid(n, h), bond=bond, **scene)
+    high = np.repeat([1.2, 1.2 * c / w], n)
+    return _system(
+        "wave_equation",
+        partial(_pulse, speed=c, width=w),
+        _grid(n, h),
+        bond={k: f"c**2*({V})" for k, V in STENCILS[accuracy].items()},
+        params={"c": c, "h": h},
+        domain=Box(-high, high),
+        t_span=(0.0, 2 * math.pi / c),
+        dt=h / (2 * c),
+    )
 
 
 def _pulse(x: np.ndarray, t: np.ndarray, speed: float, width: float) -> tuple[np.ndarray, np.ndarray]:
@@ -134,9 +142,18 @@ def sine_gordon(
         boundary, t_end = "free", _crossing(v, length)
         low, high = [-1.0, -3.0], [2 * math.pi + 1.0, 3.0]
     scale = np.array([1.0, _gamma(v)])
-    ends = {"low": np.repeat(low * scale, n), "high": np.repeat(high * scale, n)}
-    lattice: dict[str, Any] = {"onsite": "1 - cos(q)", "bond": STENCILS[accuracy], "boundary": boundary}
-    return _system("sine_gordon", shape, _grid(n, h), **lattice, params={"h": h}, **ends, t_end=t_end, dt=h / 3)
+    return _system(
+        "sine_gordon",
+        shape,
+        _grid(n, h),
+        onsite="1 - cos(q)",
+        bond=STENCILS[accuracy],
+        boundary=boundary,
+        params={"h": h},
+        domain=Box(np.repeat(low * scale, n), np.repeat(high * scale, n)),
+        t_span=(0.0, t_end),
+        dt=h / 3,
+    )
 
 
 def _breather(
@@ -187,9 +204,18 @@ def phi4(velocity: float = 0.3, n: int = 512, length: float = 80.0, accuracy: in
     n = _sites(n, accuracy)
     h, v = _positive("length", length) / n, _velocity(velocity)
     high = np.repeat([1.5, 1.5 * _gamma(v)], n)
-    wave, t_end = partial(_well_kink, velocity=v, start=_start(v, length)), _crossing(v, length)
-    lattice: dict[str, Any] = {"onsite": "(q**2 - 1)**2/4", "bond": STENCILS[accuracy], "boundary": "free"}
-    return _system("phi4", wave, _grid(n, h), **lattice, params={"h": h}, high=high, t_end=t_end, dt=h / 3)
+    return _system(
+        "phi4",
+        partial(_well_kink, velocity=v, start=_start(v, length)),
+        _grid(n, h),
+        onsite="(q**2 - 1)**2/4",
+        bond=STENCILS[accuracy],
+        boundary="free",
+        params={"h": h},
+        domain=Box(-high, high),
+        t_span=(0.0, _crossing(v, length)),
+        dt=h / 3,
+    )
 
 
 def _well_kink(x: np.ndarray, t: np.ndarray, velocity: float, start: float) -> tuple[np.ndarray, np.ndarray]:
@@ -234,13 +260,17 @@ def nonlinear_schroedinger(
     eta, v = _positive("amplitude", amplitude), float(checked_number("velocity", velocity))
     x, high = _grid(n, L / n), np.full(2 * n, 1.6 * eta)
     exact = partial(_states, partial(_soliton, amplitude=eta, velocity=v, start=_start(v, L / 2), length=L), x)
-    scene: dict[str, Any] = {
-        "name": "nonlinear_schroedinger",
-        "t_span": (0.0, _crossing(v, L / 2)),
-        "dt": 0.02 / eta**2,
-    }
-    scene |= {"domain": Box(-high, high), "y0": exact(0.0), "exact": exact}
-    return HamiltonianSystem.schroedinger("-rho**2/2", shape=n, length=L, **scene)
+    return HamiltonianSystem.schroedinger(
+        "-rho**2/2",
+        shape=n,
+        length=L,
+        name="nonlinear_schroedinger",
+        domain=Box(-high, high),
+        y0=exact(0.0),
+        t_span=(0.0, _crossing(v, L / 2)),
+        dt=0.02 / eta**2,
+        exact=exact,
+    )
 
 
 def _soliton(
@@ -284,9 +314,16 @@ def toda_chain(n: int = 128, kappa: float = 0.5) -> HamiltonianSystem:
     checked_number("kappa", k, "at most 20, for the soliton is otherwise less than a site wide", lambda x: x <= 20)
     speed = math.sinh(k) / k
     high = np.repeat([1.5 * k, 3 * k * speed * math.sinh(k) + 1e-3], n)
-    wave, bond = partial(_toda_soliton, kappa=k, start=-n / 4), "exp(-r) + r - 1"
-    ends: dict[str, Any] = {"high": high, "t_end": n / 2 / speed, "dt": 0.2 / max(1.0, speed)}
-    return _system("toda_chain", wave, _grid(n, 1.0), bond=bond, boundary="free", **ends)
+    return _system(
+        "toda_chain",
+        partial(_toda_soliton, kappa=k, start=-n / 4),
+        _grid(n, 1.0),
+        bond="exp(-r) + r - 1",
+        boundary="free",
+        domain=Box(-high, high),
+        t_span=(0.0, n / 2 / speed),
+        dt=0.2 / max(1.0, speed),
+    )
 
 
 def _toda_soliton(x: np.ndarray, t: np.ndarray, kappa: float, start: float) -> tuple[np.ndarray, np.ndarray]:
@@ -329,10 +366,18 @@ def fput_beta(n: int = 64, beta: float = 1.0, amplitude: float = 0.1) -> Hamilto
         raise ValueError(f"`n` must be even, for neighbours on the ring move against each other; got {n}.")
     b, A = _positive("beta", beta), _positive("amplitude", amplitude)
     w = math.sqrt(4 + 16 * b * A * A)
-    period, high = 4 * float(ellipk(8 * b * A * A / w**2)) / w, np.repeat([2 * A, 2 * A * w], n)
-    wave = partial(_shortest, amplitude=A, frequency=w, modulus=8 * b * A * A / w**2, n=n)
-    lattice: dict[str, Any] = {"bond": "r**2/2 + beta*r**4/4", "params": {"beta": b}}
-    return _system("fput_beta", wave, _grid(n, 1.0), **lattice, high=high, t_end=20 * period, dt=period / 40)
+    period = 4 * float(ellipk(8 * b * A * A / w**2)) / w
+    high = np.repeat([2 * A, 2 * A * w], n)
+    return _system(
+        "fput_beta",
+        partial(_shortest, amplitude=A, frequency=w, modulus=8 * b * A * A / w**2, n=n),
+        _grid(n, 1.0),
+        bond="r**2/2 + beta*r**4/4",
+        params={"beta": b},
+        domain=Box(-high, high),
+        t_span=(0.0, 20 * period),
+        dt=period / 40,
+    )
 
 
 def _shortest(
@@ -345,20 +390,21 @@ def _shortest(
     return sign * amplitude * cn, -sign * amplitude * frequency * sn * dn
 
 
+# the parts of a scene ----------------------------------------------------------------------------------------------
+
+
 def _system(
-    name: str, wave: Callable[..., Any], x: np.ndarray, high: np.ndarray, t_end: float, low: Any = None, **more: Any
+    name: str, wave: Callable[..., tuple[np.ndarray, np.ndarray]], x: np.ndarray, **definition: Any
 ) -> HamiltonianSystem:
     """The lattice on which a wave u, u_t = wave(x, t) runs."""
     exact = partial(_states, wave, x)
-    domain, y0 = Box(-high if low is None else low, high), exact(0.0)
-    return HamiltonianSystem.lattice(
-        shape=len(x), name=name, exact=exact, domain=domain, y0=y0, t_span=(0.0, t_end), **more
-    )
+    return HamiltonianSystem.lattice(shape=len(x), name=name, exact=exact, y0=exact(0.0), **definition)
 
 
 def _states(wave: Callable[..., tuple[np.ndarray, np.ndarray]], x: np.ndarray, t: Any) -> np.ndarray:
     """The states [u, u_t] at times t: (...) to (..., 2n)."""
-    u, u_t = np.broadcast_arrays(*wave(x, np.asarray(t, dtype=float)[..., None]))
+    times = np.asarray(t, dtype=float)[..., None]
+    u, u_t = np.broadcast_arrays(*wave(x, times))
     return np.concatenate([u, u_t], axis=-1)
 
 

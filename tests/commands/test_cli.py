@@ -476,7 +476,7 @@ ANSWERED = {
     "an end of a driven formula": (["solve", "p**2/2 + q*cos(t)", "--t", "3"], "did you mean --t-end"),
     "a keyword": (["solve", "p^2/2 + lambda*q"], "'lambda', which is a word of Python"),
     "a foreign option": (["solve", "pendulum", "--solver", "verlet"], "did you mean --method"),
-    "a parameter of others": (["solve", "kepler", "--param", "e=0.3"], "`--param` is no option: write --e 0.3"),
+    "a parameter of others": (["solve", "kepler", "--param", "e=0.3"], "`--param` is not an option: write --e 0.3"),
     "an option of a method": (["solve", "kepler", "--rtol", "1e-8"], "behind the name, --method NAME:rtol=1e-8"),
     "a late start": (
         ["solve", "pendulum", "--t-start", "200"],

@@ -565,8 +565,8 @@ def test_bad_arguments_of_elements(call, error, message):
     [
         (
             SOLAR,
-            {"method": "wisdom_holman", "dt": 12.0, "t_span": (0, 800.0)},
-            "`dt` 12 is long .* body 1, 87.97, apart",
+            {"method": "wisdom_holman", "dt": 8.0, "t_span": (0, 800.0)},
+            "`dt` 8 is long .* body 1, 87.97, apart",
         ),
         (systems.outer_solar_system(), {"method": "wisdom_holman", "t_span": (0, 2e4)}, "cross, .* bodies 4 and 5"),
     ],
@@ -604,11 +604,12 @@ def test_elements_have_names():
 
 
 @pytest.mark.parametrize("dt", [5.0, 8.0])
-def test_usual_steps_of_the_solar_system_are_no_reason_to_warn(dt):
+def test_usual_steps_of_the_solar_system_are_warned_of_and_right(dt):
     """Kicks eleven times in a period of Mercury: in ten years it stays within 1e-5 of its place."""
     system = systems.solar_system()
     right = solve(system, "dop853", (0, 3652.5), t_eval=[3652.5], rtol=1e-12, atol=1e-15).y[3:6, 0]
-    found = solve(system, "wisdom_holman", (0, 3652.5), dt=dt, corrector=17, t_eval=[3652.5]).y[3:6, 0]
+    with pytest.warns(RuntimeWarning, match="more than a twentieth of the period of body 1"):
+        found = solve(system, "wisdom_holman", (0, 3652.5), dt=dt, corrector=17, t_eval=[3652.5]).y[3:6, 0]
     assert np.linalg.norm(found - right) < 1e-5 * np.linalg.norm(right)
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sympflow.arguments import put_file
 from sympflow.storage import store as module
 from sympflow.storage.store import Appender, Field, Store, StoreError, difference
 
@@ -82,6 +83,17 @@ def test_a_full_disk_loses_nothing(tmp_path, monkeypatch):
     assert again.attributes["reached"] == 6
     np.testing.assert_array_equal(again.read("time"), np.arange(6.0))
     assert not list(path.rglob(".new-*"))
+
+
+@pytest.mark.skipif(os.name != "posix", reason="permissions are those of POSIX")
+@pytest.mark.parametrize("mask", [0o022, 0o027, 0o002])
+def test_permissions_follow_the_umask(tmp_path, mask):
+    before = os.umask(mask)
+    try:
+        put_file(tmp_path / "state.pt", b"numbers")
+    finally:
+        os.umask(before)
+    assert (tmp_path / "state.pt").stat().st_mode & 0o777 == 0o666 & ~mask
 
 
 def test_damage_is_told(tmp_path):
