@@ -1,7 +1,12 @@
 """Flows of lattices: fitted on a ring of a few sites, written out by its coordinates, judged on many.
 
-One step on a few sites tells little of what a large lattice does to its energy in a thousand. So the best few tables at
-Δt that labels find are fitted further, to the errors of H in runs from many states of a larger ring.
+The numbers of a primed flow depend on the potential and Δt, not on the size. So they are fitted at states of the energy
+density of the large lattice. Held-out states and the certificate are those of the large one, with its own ends.
+
+One step on a few sites tells little of what a large lattice does to its energy in a thousand. The modified energy that
+a flow keeps differs from H by terms that hardly change in a step, such as the actions of waves whose frequencies are a
+bit wrong; these change as waves exchange energy, and a few sites have few wave lengths. So the best few tables at Δt
+that labels find are fitted further, to the errors of H in runs from many states of a larger ring.
 """
 
 from __future__ import annotations

@@ -1,8 +1,17 @@
 """The fit of a primed flow: the numbers of its splitting table, fitted to the exact flow of a system by Gauss–Newton.
 
-First the table frozen at Δt, a dozen or two numbers, from many random starts, for the cost has many local minima. Then
-the best of these to the end of their narrow valleys, at last with the weight of the energy. Then the polynomials in t,
-from the best tables, to labels at several times in (0, Δt], and other losses. Without labels there is that stage alone.
+In three stages. First the table frozen at Δt, a dozen or two numbers, from many random starts, each followed for a
+few iterations: the cost has many local minima. Then the best of these to the end of their narrow valleys, at last with
+the weight of the energy, with which these are harder to find. Then the polynomials in t, from the best of these tables,
+to labels at several times in (0, Δt].
+
+Other losses (the residual of the flow, Hamiltonian matching) join in the last stage. Without labels there is that stage
+alone, from each start.
+
+Where long runs count, those of a lattice for instance, the best few tables are fitted to these in the end. The best of
+them is the table at Δt, and the polynomials are fitted to the labels before it, if there are as many times as powers.
+
+Every piece of it has a deadline, which each evaluation checks.
 """
 
 from __future__ import annotations
