@@ -106,7 +106,12 @@ class Batch(NamedTuple):
 
 
 def run_states(
-    rollout: Callable[[Batch], None], task: Task, width: int, work: float, start: Any = None, counts: bool = False
+    rollout: Callable[[Batch], None],
+    task: Task,
+    width: int,
+    work: float,
+    start: np.ndarray | None = None,
+    counts: bool = False,
 ) -> Run:
     """A run of every row of a task by `rollout(batch)`, which is compiled, on as many threads as pay.
 
