@@ -123,7 +123,10 @@ def _fastest_at(system: Any, t: float, y: np.ndarray | None) -> float:
 
 
 def rate_of_motion(system: Any, times: Sequence[float], states: Sequence[np.ndarray]) -> float:
-    """The rate √(|(J∇²H)² ẏ|/|ẏ|) of the motion at states (..., 2d) of times, ω of an oscillation; 0 if not known."""
+    """The rate √(|(J∇²H)² ẏ|/|ẏ|) of the motion at states (..., 2d) of times, ω of an oscillation; 0 if not known.
+
+    Modes that do not move, such as the highest ones of a grid, have no part in it.
+    """
     sizes = np.zeros((2, 1))
     with np.errstate(all="ignore"), suppress(ArithmeticError, ValueError, TypeError):
         for t, y in zip(times, map(_few, states), strict=True) if system.ndof <= MOST_DENSE else ():

@@ -321,7 +321,14 @@ def _end(
 
 
 def warn_of_long_steps(outcome: Outcome, integrator: Integrator, problem: Problem) -> None:
-    """Warn of what a method doubts, and of steps with which the energy is off by `TOO_LONG` of its size."""
+    """Warn of what a method doubts, and of steps with which the energy is off by `TOO_LONG` of its size.
+
+    Where energy is not kept, the motion at the start and the end must not be too fast for the step. On a clock the
+    energy may be kept although the time is wrong: a run of few steps is compared with one in halves.
+
+    H is evaluated at the start and a few outputs, of large systems at one for every 200 steps, and not in runs of few
+    steps that are not long, which would take twice the time. Its size is ½ Σ|y_i ∂H/∂y_i|, that of an oscillator.
+    """
     system, n, n_steps = problem.system, len(outcome.t), outcome.stats.get("n_steps", 0)
     dt, known, few = None, False, False
     if isinstance(integrator, FixedStep):

@@ -190,7 +190,10 @@ def _merged(found: list[Outcome], problem: Problem, pieces: list[Any], impulses:
 
 @dataclass(frozen=True)
 class PiecewiseSolution:
-    """The dense output of a run in pieces: that of the piece in which t lies, at an impulse the later one."""
+    """The dense output of a run in pieces: that of the piece in which t lies, at an impulse the later one.
+
+    `spans` (n, 2) are their ends, which decrease in a run back in time.
+    """
 
     pieces: tuple[Callable[[Any], Array], ...]
     spans: np.ndarray
