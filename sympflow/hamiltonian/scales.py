@@ -12,7 +12,7 @@ from sympflow.hamiltonian.definition import bare_copy
 from sympflow.lazy import kept, lately_kept
 
 STATES = 64  # states of a domain at which Hessians are taken, where there is no y0
-MOST_DENSE = 200  # degrees of freedom of lattices and pairs of which steps and Hessians are matrices
+MOST_DENSE = 200  # degrees of freedom of lattices and pairs up to which steps and Hessians are matrices
 SLOW = 0.1  # radians in a step of the system, the rate where nothing in H gives one
 STEP = 0.05  # radians of the fastest motion in a default step
 MOST_RATES = 16  # states of a batch at which rates are taken

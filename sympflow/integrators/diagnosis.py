@@ -422,7 +422,8 @@ def _energy_off(outcome: Outcome, problem: Problem, seen: int, each: bool) -> fl
 
 def _end_off(outcome: Outcome, integrator: FixedStep, problem: Problem) -> float:
     """How far a run with half the step ends from an outcome, over the size of q or p; 0 where that is not known."""
-    end, half = float(outcome.t[-1]), replace(integrator, dt=0.5 * integrator.step_length(problem.system))
+    end = float(outcome.t[-1])
+    half = replace(integrator, dt=0.5 * integrator.step_length(problem.system))
     again = half.run(replace(problem, t1=end, t_eval=np.array([end]), events=None, progress=None))
     if _failed(again) or not len(again.t):
         return 0.0
