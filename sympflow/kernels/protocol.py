@@ -197,7 +197,7 @@ class Kernel(ABC):
 
         The states after the steps of `save`, sorted int64, are kept. A `carry` says where the run goes on, and is left
         with its end: all counts are from `y0`, with which the first piece began, and `save` begins after
-        ``carry.steps``.
+        ``carry.steps``. Without `threads` there are as many as pay.
         """
         if y0.ndim > 1:
             return self.runs(Task(h, y0, n_steps, save, carry, t0, threads))
