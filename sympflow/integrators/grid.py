@@ -78,7 +78,10 @@ class Grid:
 
 
 class Outputs:
-    """The outputs of a run by their numbers 0 … n − 1, of which a part is made at a time."""
+    """The outputs of a run by their numbers 0 … n − 1; a part of them is made at a time.
+
+    These are the times of `t_eval`, or those of every `save_every`-th step and the end.
+    """
 
     def __init__(self, grid: Grid, t_eval: np.ndarray | None, save_every: int) -> None:
         self.grid, self.t_eval, self.every = grid, t_eval, save_every
