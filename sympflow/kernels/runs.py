@@ -400,7 +400,11 @@ class _History:
 
 
 class Memory:
-    """The state, its end, and the state before a block of steps, in memory."""
+    """The state, its end, and the state before a block of steps, in memory.
+
+    A subclass may order numbers in another way than rows do: see `open`, `store` and `keep`. Numbers are copied
+    `at_once`; `chunks` groups of trajectories run in turn.
+    """
 
     at_once = chunks = 1
     n_values: Any

@@ -283,7 +283,7 @@ class SplittingLoops:
         t: np.ndarray,
         varied: bool,
     ) -> np.ndarray:
-        """`step_rows` with friction, whose numbers are no polynomials: by one table, or one of its own for each row."""
+        """`step_rows` with friction, whose numbers are not polynomials: by one table, or one for each row."""
         alike = len(y) > 0 and not varied and bool((h == h[0]).all() and (t == t[0]).all())
         rows, key = slice(0, 1 if alike else len(y)), (table, x[0], h[0], t[0]) if alike else None
         known, numbers = self._damped_numbers
