@@ -14,7 +14,7 @@ MOST_OPEN_STEPS = 1_000_000
 
 
 def open_end(t0: float, t1: float, dt: float) -> float:
-    """Return t1, or for an infinite one the end of `most` steps of length dt."""
+    """Return t1, or for an infinite one the end of `MOST_OPEN_STEPS` steps of length dt."""
     return t1 if math.isfinite(t1) else t0 + math.copysign(MOST_OPEN_STEPS * dt, t1)
 
 
