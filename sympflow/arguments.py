@@ -370,7 +370,7 @@ def advice(name: str, known: Iterable[str]) -> str:
 
 
 def told(function: Callable[P, T]) -> Callable[P, T]:
-    """Decorate a function: a call that does not fit its arguments is told which there are."""
+    """Decorate a function so that a call that does not fit its arguments raises a TypeError with the remedy."""
 
     @wraps(function)
     def call(*args: P.args, **options: P.kwargs) -> T:

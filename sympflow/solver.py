@@ -499,7 +499,8 @@ def _solved_rows(integrator: Integrator, problem: Problem, action: str, rows: Pa
         pieces.append((index, stop.solution))
         whole = max((sol for _, sol in pieces), key=lambda sol: len(sol.t))
         for index, part in groups[len(pieces) :]:  # not begun
-            y, status = part.y0[..., None][..., :0], np.full(tuple(part.y0.shape[:-1]), -1)
+            y = part.y0[..., None][..., :0]
+            status = np.full(tuple(part.y0.shape[:-1]), -1)
             own = replace(stop.solution, t=whole.t[:0], y=y, status=status, system=part.system, y0=part.y0)
             pieces.append((index, own))
         for i, (index, sol) in enumerate(pieces):  # unknown, NaN, at the last outputs

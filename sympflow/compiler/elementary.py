@@ -510,8 +510,8 @@ for _name in OF_SCIPY:
     _lowered(_name, inline=0)(partial(_by_scipy, name=_name))
 
 
-for _name, (_value, _) in COMPOSED.items():
-    _lowered(_name)(_value)
+for _name, _composed in COMPOSED.items():
+    _lowered(_name)(_composed.value)
 
 # the derivatives of ln Γ, which C has not: Abramowitz and Stegun (1964), 6.3.18 and 6.4.11 from 16 on, below by
 # recurrence, below 1/2 by reflection --------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -210,28 +210,34 @@ FUNCTIONS: dict[str, Function] = {
     "dawsn": Function(_special("dawsn"), _no_tensors("dawsn"), lambda y, x: (1.0 - 2.0 * x * y,), 200),
 }
 # fmt: on
-COMPOSED: dict[str, tuple[Callable[[Any], Any], Callable[[Any, Any], Any]]] = {
-    "expit": (lambda x: 1.0 / (1.0 + apply("exp", -x)), lambda y, x: y * apply("expit", -x)),
-    "bose": (lambda x: 1.0 / apply("expm1", x), lambda y, x: y * apply("bose", -x)),
-    "softplus": (
+
+
+class Composed(NamedTuple):
+    """A function of x made of others: its `value`, and ``slope(y, x)``, its derivative with its value y."""
+
+    value: Callable[[Any], Any]
+    slope: Callable[[Any, Any], Any]
+
+    def function(self) -> Function:
+        return Function(self.value, self.value, lambda y, x: (self.slope(y, x),), 160)
+
+
+COMPOSED = {
+    "expit": Composed(lambda x: 1.0 / (1.0 + apply("exp", -x)), lambda y, x: y * apply("expit", -x)),
+    "bose": Composed(lambda x: 1.0 / apply("expm1", x), lambda y, x: y * apply("bose", -x)),
+    "softplus": Composed(
         lambda x: apply("max", x, 0.0) + apply("log1p", apply("exp", -abs(x))),
         lambda y, x: apply("expit", x),
     ),
-    "logcosh": (
+    "logcosh": Composed(
         lambda x: abs(x) + (apply("log1p", apply("exp", -2.0 * abs(x))) - math.log(2.0)),
         lambda y, x: apply("tanh", x),
     ),
-    "sech": (lambda x: 1.0 / apply("cosh", x), lambda y, x: -(y * apply("tanh", x))),
-    "csch": (lambda x: 1.0 / apply("sinh", x), lambda y, x: -(y / apply("tanh", x))),
+    "sech": Composed(lambda x: 1.0 / apply("cosh", x), lambda y, x: -(y * apply("tanh", x))),
+    "csch": Composed(lambda x: 1.0 / apply("sinh", x), lambda y, x: -(y / apply("tanh", x))),
 }
-"""Functions of others, with derivatives that do not overflow where parts of them do: of x, and of the value y and x."""
-
-
-def _composed(value: Callable[[Any], Any], slope: Callable[[Any, Any], Any]) -> Function:
-    return Function(value, value, lambda y, x: (slope(y, x),), 160)
-
-
-FUNCTIONS |= {name: _composed(*pair) for name, pair in COMPOSED.items()}
+"""Functions of others, whose derivatives do not overflow where parts of them do."""
+FUNCTIONS |= {name: composed.function() for name, composed in COMPOSED.items()}
 OF_SCIPY = (
     *("gamma", "gammainc", "gammaincc", "jv", "yv", "iv", "kv"),
     *("ellipk", "ellipe", "hyp2f1", "expi", "exp1", "dawsn"),

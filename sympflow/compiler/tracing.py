@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sympflow.arrays import is_tensor
-from sympflow.compiler.functions import OF_SCIPY, apply
+from sympflow.compiler.functions import COMPOSED, OF_SCIPY, apply
 from sympflow.compiler.program import Program, Recording, Traced, reached, traced
 
 __all__ = ["WEIGHTS", "Chain", "TracedArray", "Untraceable", "trace", "trace_chain"]
@@ -250,8 +250,7 @@ def _logaddexp(x: Any, y: Any) -> Any:
     return apply("max", x, y) + apply("log1p", apply("exp", -abs(x - y)))
 
 
-def _softplus(x: Any) -> Any:
-    return apply("max", x, 0.0) + apply("log1p", apply("exp", -abs(x)))
+_softplus = COMPOSED["softplus"].value
 
 
 def _sinc(x: Any) -> Any:
@@ -299,7 +298,7 @@ ELEMENTS: dict[str, Callable[..., Any]] = {
     "rad2deg": lambda x: x * (180 / math.pi), "degrees": lambda x: x * (180 / math.pi),
     "copysign": lambda x, y: abs(x) * _choose(apply("lt", y, 0.0), -1.0, 1.0),
     "heaviside": lambda x, zero: _choose(apply("eq", x, 0.0), zero, _choose(apply("lt", 0.0, x), 1.0, 0.0)),
-    "logaddexp": _logaddexp, "expit": lambda x: 1.0 / (1.0 + apply("exp", -x)), "log_expit": lambda x: -_softplus(-x),
+    "logaddexp": _logaddexp, "expit": COMPOSED["expit"].value, "log_expit": lambda x: -_softplus(-x),
     "xlogy": lambda x, y: _choose(apply("eq", x, 0.0), 0.0, x * apply("log", y)),
     **{name: _of(name) for name in OF_SCIPY}, **{f"{f}{n}": lambda x, f=f, n=n: apply(f"{f}v", float(n), x)
        for f in "jyik" for n in (0, 1)},

@@ -2,7 +2,7 @@
 
     linear    Σ_f s_f(t) E_f(x), E_f the energy of the modes of frequency ω_f, turned by the exact flow
     kick      V(t, q) = w(t) U(A(t) q) − γ(t) ½|∇_q U(A(t) q)|²_{M⁻¹},  A(t) = C φ(t) C⁻¹ a filter of the normal modes
-    shear     the same for a part H_k(q, p) of which no two variables are conjugate, without γ
+    shear     the same for a part H_k(q, p) without two conjugate variables, without γ
 
 in the notation of `sympflow.linear_part` and `sympflow.parts`; s, w, γ and φ are even polynomials in t, times t, t,
 t³ and 1. The impulse method (φ = 1), the mollified impulse (φ = sinc) and Nyström splittings with the exact linear flow

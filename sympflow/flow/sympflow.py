@@ -262,7 +262,7 @@ class SympFlow(FlowMap):
         Raises
         ------
         TypeError
-            If a layer is no kick or drift with an MLP potential.
+            If a layer is not a kick or drift with an MLP potential.
         """
         found = []
         for layer in self.layers:

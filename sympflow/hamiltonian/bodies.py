@@ -301,7 +301,8 @@ class PairsHamiltonian(LocalHamiltonian):
         for pairs in self._pairs(q, p / np.repeat(self.inertia, self.dim)):
             x, w = pairs.x
             r, side = np.sqrt(pairs.s), np.sign(x @ ASLANT[: self.dim])
-            speed, across = _dot(w, w), w - (_dot(x, w) / np.maximum(_dot(x, x), TINY))[..., None] * x
+            speed = _dot(w, w)
+            across = w - (_dot(x, w) / np.maximum(_dot(x, x), TINY))[..., None] * x
             straight = (speed > 0) & (_dot(across, across) <= STRAIGHT**2 * speed)
             along = straight.all(0, keepdims=True) if together else straight
             yield pairs.i, pairs.j, np.where(along, side, 1.0) * r, pairs.symbol_values

@@ -321,7 +321,14 @@ def _end(
 
 
 def warn_of_long_steps(outcome: Outcome, integrator: Integrator, problem: Problem) -> None:
-    """Warn of what a method doubts, and of steps with which the energy is off by `TOO_LONG` of its size."""
+    """Warn of what a method doubts, and of steps with which the energy is off by `TOO_LONG` of its size.
+
+    Where energy is not kept, the motion at the start and the end must not be too fast for the step. On a clock the
+    energy may be kept although the time is wrong: a run of few steps is compared with one in halves.
+
+    H is evaluated at the start and a few outputs, of large systems at one for every 200 steps, and not in runs of few
+    steps that are not long, which would take twice the time. Its size is ½ Σ|y_i ∂H/∂y_i|, that of an oscillator.
+    """
     system, n, n_steps = problem.system, len(outcome.t), outcome.stats.get("n_steps", 0)
     dt, known, few = None, False, False
     if isinstance(integrator, FixedStep):
@@ -415,7 +422,8 @@ def _energy_off(outcome: Outcome, problem: Problem, seen: int, each: bool) -> fl
 
 def _end_off(outcome: Outcome, integrator: FixedStep, problem: Problem) -> float:
     """How far a run with half the step ends from an outcome, over the size of q or p; 0 where that is not known."""
-    end, half = float(outcome.t[-1]), replace(integrator, dt=0.5 * integrator.step_length(problem.system))
+    end = float(outcome.t[-1])
+    half = replace(integrator, dt=0.5 * integrator.step_length(problem.system))
     again = half.run(replace(problem, t1=end, t_eval=np.array([end]), events=None, progress=None))
     if _failed(again) or not len(again.t):
         return 0.0

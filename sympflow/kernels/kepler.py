@@ -257,7 +257,13 @@ class KeplerCode(Rollouts):
         return [p - q for p, q in zip(a, program(*h, *given), strict=True)]
 
     def _accelerations(
-        self, room: Room, x: list[Vectors], c: list[dict[str, Value]], inverses: Vectors, kick: Value, watch: Any = None
+        self,
+        room: Room,
+        x: list[Vectors],
+        c: list[dict[str, Value]],
+        inverses: Vectors,
+        kick: Value,
+        watch: Callable[[Value, list[Vectors]], Value] | None = None,
     ) -> tuple[list[Vectors], Value]:
         """The accelerations by the interaction, and the length of the kick, which is NaN where planets met."""
         code, groups, zero = room.code, range(self.groups), room.code.constant(0.0, REGISTER)

@@ -160,7 +160,7 @@ class Potential:
         self.slopes, self.bends, self.bent = (Program(given, values) for values in (slopes, bends, bent))
 
     def kept(self, costly: bool) -> list[int]:
-        """The second derivatives that are no constants, of those that are alike the first; or the costly ones alone."""
+        """The second derivatives that are not constant, of those that are alike the first; or the costly ones alone."""
         found: dict[int, int] = {}
         for k, f in enumerate(self.bends.outputs):
             needs = reached([f])

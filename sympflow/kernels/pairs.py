@@ -161,13 +161,13 @@ def few(local: PairsHamiltonian) -> tuple[Callable[..., Splitting] | None, tuple
 class FewSplitting(Splitting):
     """The kicks and drifts of a few bodies."""
 
+    polynomial = False
+
     @property
     def key(self) -> tuple[Any, ...]:
         local = self.symbols.local
         pair = local.V, local.first, local.c, local.cutoff is None, local.box is None
         return *pair, local.n_bodies, local.dim, self.level, self.compensated, self.friction
-
-    polynomial = False
 
     def kinds(self) -> Sequence[Stage | WithinRange]:
         _check_level(self.level)

@@ -106,7 +106,12 @@ class Batch(NamedTuple):
 
 
 def run_states(
-    rollout: Callable[[Batch], None], task: Task, width: int, work: float, start: Any = None, counts: bool = False
+    rollout: Callable[[Batch], None],
+    task: Task,
+    width: int,
+    work: float,
+    start: np.ndarray | None = None,
+    counts: bool = False,
 ) -> Run:
     """A run of every row of a task by `rollout(batch)`, which is compiled, on as many threads as pay.
 
@@ -192,7 +197,7 @@ class Kernel(ABC):
 
         The states after the steps of `save`, sorted int64, are kept. A `carry` says where the run goes on, and is left
         with its end: all counts are from `y0`, with which the first piece began, and `save` begins after
-        ``carry.steps``.
+        ``carry.steps``. Without `threads` there are as many as pay.
         """
         if y0.ndim > 1:
             return self.runs(Task(h, y0, n_steps, save, carry, t0, threads))

@@ -269,7 +269,13 @@ def reverse_function(
 
 
 def map_function(
-    n_values: int, n_out: int, size: int, stage: AnyStage, width: int = 1, memory: Any = None, timed: bool = False
+    n_values: int,
+    n_out: int,
+    size: int,
+    stage: AnyStage,
+    width: int = 1,
+    memory: Callable[..., Memory] | None = None,
+    timed: bool = False,
 ) -> Callable[..., None]:
     """Compile a map of rows: all columns of one table. If `timed`, stages are given the steps of each lane.
 
@@ -394,7 +400,11 @@ class _History:
 
 
 class Memory:
-    """The state, its end, and the state before a block of steps, in memory."""
+    """The state, its end, and the state before a block of steps, in memory.
+
+    A subclass may order numbers in another way than rows do: see `open`, `store` and `keep`. Numbers are copied
+    `at_once`; `chunks` groups of trajectories run in turn.
+    """
 
     at_once = chunks = 1
     n_values: Any
@@ -648,7 +658,15 @@ class ColumnStage:
     """The stage of a column: all lanes have the same numbers, or each its own, in tables of a length."""
 
     def __init__(
-        self, code: Code, table: Value, kinds: Value, size: int, lanes: int, width: int, stage: Any, length: Any = None
+        self,
+        code: Code,
+        table: Value,
+        kinds: Value,
+        size: int,
+        lanes: int,
+        width: int,
+        stage: AnyStage,
+        length: Value | None = None,
     ) -> None:
         self.code, self._table, self._kinds, self._size, self._lanes = code, table, kinds, size, lanes
         self._width, self._stage, self._length = width, stage, length

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import copy
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, ClassVar
@@ -192,7 +193,7 @@ class TableRun(SearchRun):
         self.table.assign(best.x)
         self._record(best, self._keep_better(session))
 
-    def _completed_by_runs(self, session: Session, runs: Any, finalists: list[Minimum]) -> bool:
+    def _completed_by_runs(self, session: Session, runs: RunsFit, finalists: list[Minimum]) -> bool:
         """Fit the finalists to long runs and take the best; False, with a warning, where there are none to compare."""
         labels = self.weighted or self.frozen
         assert labels is not None
@@ -382,8 +383,17 @@ class StackedFit(Problem):
         return np.concatenate([w * r for w, r, _ in pieces]), np.concatenate([w * J for w, _, J in pieces])
 
 
-MadeRuns = Callable[[PrimedFlow], Any]
-"""Errors in long runs by the frozen parameters of a flow's table: see `sympflow.training.lattice_fit.EnergyRuns`."""
+class RunsFit(Problem, ABC):
+    """Errors in long runs by the frozen parameters of a table."""
+
+    record: dict[str, Any]
+
+    @abstractmethod
+    def parameters(self, theta: np.ndarray) -> np.ndarray:
+        """The flow's parameters that make the table of `theta` at Δt."""
+
+
+MadeRuns = Callable[[PrimedFlow], RunsFit]
 
 
 class Restricted(Problem):

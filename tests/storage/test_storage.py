@@ -97,7 +97,8 @@ def test_permissions_follow_the_umask(tmp_path, mask):
 
 
 def test_damage_is_told(tmp_path):
-    store, chunk = made(tmp_path / "run.zarr"), tmp_path / "run.zarr" / "dof" / "0"
+    store = made(tmp_path / "run.zarr")
+    chunk = tmp_path / "run.zarr" / "dof" / "0"
     data = bytearray(chunk.read_bytes())
     data[9] ^= 1
     chunk.write_bytes(bytes(data))
