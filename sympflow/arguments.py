@@ -7,8 +7,8 @@ import inspect
 import math
 import os
 import reprlib
+import secrets
 import sys
-import tempfile
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -26,7 +26,7 @@ P = ParamSpec("P")
 T = TypeVar("T")
 MAX_SAVED_VALUES = 10_000_000
 MAX_ASKED_VALUES = 1_000_000_000  # values of a batch, or of outputs that were asked for one by one: 8 GB
-LONGEST_STEP = 1e100  # beyond it the powers of dt in a step are no floating-point numbers
+LONGEST_STEP = 1e100  # beyond it the powers of dt in a step overflow
 _FLOAT64 = np.dtype(np.float64)
 _PLAIN = {float, int}
 FEWEST_TIMES = 8  # floating-point numbers that an interval must span
@@ -370,7 +370,7 @@ def advice(name: str, known: Iterable[str]) -> str:
 
 
 def told(function: Callable[P, T]) -> Callable[P, T]:
-    """Decorate a function: a call that does not fit its arguments is told which there are."""
+    """Decorate a function so that a call that does not fit its arguments raises a TypeError with the remedy."""
 
     @wraps(function)
     def call(*args: P.args, **options: P.kwargs) -> T:
@@ -448,16 +448,19 @@ def naming_path(path: Path) -> Iterator[None]:
 
 
 def put_file(path: Path, content: bytes, durable: bool = True) -> None:
-    """Write a file beside its place and move it there in one step; `durable` once the disk has it."""
-    handle, unfinished = tempfile.mkstemp(dir=path.parent, prefix=".new-")
+    """Write a file beside its place and move it there in one step; `durable` once the disk has it.
+
+    It is opened as any new file, and not by `tempfile`, so that its permissions follow the umask.
+    """
+    unfinished = path.with_name(f".new-{secrets.token_hex(8)}")
+    opened = unfinished.open("xb")
     try:
-        with os.fdopen(handle, "wb") as file:
+        with opened as file:
             file.write(content)
             file.flush()
             if durable:
                 os.fsync(file.fileno())
-        os.chmod(unfinished, 0o644)
         os.replace(unfinished, path)
     except BaseException:
-        Path(unfinished).unlink(missing_ok=True)
+        unfinished.unlink(missing_ok=True)
         raise

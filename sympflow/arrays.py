@@ -182,7 +182,10 @@ def one_lane(x: Array) -> np.ndarray:
 
 
 def unfollowed(x: Array) -> Array:
-    """Return `x` as a tensor that torch follows by no means, under `torch.func.vmap` its first lane; arrays pass."""
+    """Return `x` as a tensor that torch follows by no means, under `torch.func.vmap` its first lane; arrays pass.
+
+    `x.detach()` inside a transform of `torch.func` is a tensor of that transform still.
+    """
     plain, order = _behind(x)
     if plain is None or isinstance(plain, np.ndarray):
         return detached(x)
@@ -273,7 +276,10 @@ def _is_symbolic(x: Any) -> bool:
 
 
 def finite_states(y: Array, *, in_any_lane: bool = False) -> np.ndarray:
-    """Return True for each of the states y (..., k) that is finite: (...) booleans."""
+    """Return True for each of the states y (..., k) that is finite: (...) booleans.
+
+    Tensors under `torch.func.vmap` are judged in all lanes, or in any; where there are no values, all states pass.
+    """
     if not is_tensor(y):
         return np.isfinite(y).all(-1)
     if y.device.type == "cpu" and (found := values(y)) is not None and found.ndim == y.ndim:
@@ -313,7 +319,10 @@ def known_finite(y: Array) -> bool:
 
 
 def jvp(f: Callable[[Array], Array], x: Array, v: Array) -> tuple[Array, Array]:
-    """Return f(x) and its derivative at the tensor x along v, by torch, without the warnings that its set-up gives."""
+    """Return f(x) and its derivative at the tensor x along v, by torch, without the warnings that its set-up gives.
+
+    By forward mode; inside `torch.autograd.forward_ad`, which cannot be nested, by reverse mode twice.
+    """
     import torch
 
     _set_up()
@@ -372,7 +381,7 @@ def detached(x: Any) -> Any:
 def opaque(function: Any, *x: Array) -> Array:
     """Return a function of NumPy arrays of arrays x, or of tensors, which torch differentiates by its own rules.
 
-    It has `value(*arrays)`; `jvp(x, v)`, the derivative along v, of which entries may be None; `vjp(x, w, wanted)`,
+    It has `value(*arrays)`; `jvp(x, v)`, the derivative along v, whose entries may be None; `vjp(x, w, wanted)`,
     the derivatives of Σ w·value by those of x that are wanted.
     """
     return _opaque_function().apply(function, *x) if is_tensor(x[0]) else function.value(*x)

@@ -113,7 +113,10 @@ class EventSearch:
     def step(
         self, t_old: float, y_old: Array, t: float, y: Array, dense: Dense, inner: Sequence[Array] | None = None
     ) -> tuple[float, Array] | None:
-        """Search one step from (t_old, y_old) to (t, y): where the run ends in it, if it does."""
+        """Search one step from (t_old, y_old) to (t, y): where the run ends in it, if it does.
+
+        `inner` are the states that divide the step into equal parts, if they are known already.
+        """
         first = self.values is None
         if first:
             self.values = [event.value(t_old, y_old) for event in self.events]

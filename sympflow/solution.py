@@ -363,10 +363,10 @@ def _stored(name: str, read: Callable[[RunStore], Any]) -> property:
     """A field, kept under a name, that is read from the store unless it is set."""
 
     def get(sol: StoredSolution) -> Any:
-        known = vars(sol)[name]
+        known = getattr(sol, name)
         return read(sol.store) if sol.store is not None and known is None else known
 
-    return property(get, lambda sol, value: vars(sol).update({name: value}))
+    return property(get, lambda sol, value: setattr(sol, name, value))
 
 
 class StoredSolution(Solution):

@@ -39,14 +39,8 @@ from sympflow.arrays import (
 from sympflow.integrators.base import run_and_search
 from sympflow.integrators.choosing import check_tolerance, choose_method, state_error, step_for, with_start, with_step
 from sympflow.integrators.contract import Failure, Integrator, Interrupted, Outcome, Problem
-from sympflow.integrators.diagnosis import (
-    check_domain,
-    check_system_along,
-    diagnose,
-    diagnose_piece,
-    note_poles,
-    note_singularities_of_rows,
-)
+from sympflow.integrators.diagnosis import diagnose, diagnose_piece, note_poles, note_singularities_of_rows
+from sympflow.integrators.domain_exit import check_domain, check_system_along
 from sympflow.integrators.grid import MOST_OPEN_STEPS, no_event
 from sympflow.integrators.grid_runs import report_lanes
 from sympflow.integrators.impulses import landings, run_in_pieces
@@ -505,7 +499,8 @@ def _solved_rows(integrator: Integrator, problem: Problem, action: str, rows: Pa
         pieces.append((index, stop.solution))
         whole = max((sol for _, sol in pieces), key=lambda sol: len(sol.t))
         for index, part in groups[len(pieces) :]:  # not begun
-            y, status = part.y0[..., None][..., :0], np.full(tuple(part.y0.shape[:-1]), -1)
+            y = part.y0[..., None][..., :0]
+            status = np.full(tuple(part.y0.shape[:-1]), -1)
             own = replace(stop.solution, t=whole.t[:0], y=y, status=status, system=part.system, y0=part.y0)
             pieces.append((index, own))
         for i, (index, sol) in enumerate(pieces):  # unknown, NaN, at the last outputs

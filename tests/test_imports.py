@@ -71,3 +71,5 @@ def test_unknown_attributes_are_attribute_errors():
 
     with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
         sympflow.nonsense  # noqa: B018
+    with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
+        sympflow.interop.nonsense  # noqa: B018

@@ -72,7 +72,8 @@ def compare(
         from sympflow.studies.comparison import combined_table
         from sympflow.studies.comparison import compare as compare_methods
 
-        chosen, found = words.methods(method_names), words.scenes(systems, own)
+        chosen = words.methods(method_names)
+        found = words.scenes(systems, own)
         options = asked(ctx, "dt n_outputs repeats match backend") | {"y0": words.state(y0)}
         measured = None if metrics is None else words.listed(metrics)
         ready_folder(to)
@@ -123,7 +124,8 @@ def bench(
         from sympflow.show.style import save
         from sympflow.studies.precision import work_precision
 
-        chosen, found = words.methods(method_names), words.scenes(systems, own)
+        chosen = words.methods(method_names)
+        found = words.scenes(systems, own)
         options = asked(ctx, "n_outputs repeats budget backend") | {"y0": words.state(y0)}
         ready_folder(to)
         for scene in found:
@@ -175,7 +177,8 @@ def stability(
     with reporting(ctx):
         from sympflow.studies.step_stability import stability as find_stability
 
-        chosen, found = words.methods(method_names), words.scenes(systems, own)
+        chosen = words.methods(method_names)
+        found = words.scenes(systems, own)
         options = asked(ctx, "bound limits") | {"dtypes": words.listed(dtypes), "metrics": words.listed(metrics)}
         options["steps"] = words.parsed("--steps", steps, words.numbers, "numbers separated by commas")
         ready_folder(to)
@@ -189,7 +192,8 @@ def stability(
                 report = find_stability(family, chosen, t_span=span, y0=words.state(y0), progress=say, **options)
             show(report.table())
             if to is not None:
-                written, picture = report.to_csv(to / f"{scene.key}-stability.csv"), to / f"{scene.key}-stability.png"
+                written = report.to_csv(to / f"{scene.key}-stability.csv")
+                picture = to / f"{scene.key}-stability.png"
                 report.plot(picture)
                 console.tell(to, [written, picture])
 
@@ -250,7 +254,8 @@ def section(
         from sympflow.show.style import save
         from sympflow.studies.poincare import names, poincare_section
 
-        scene, chosen = words.one_scene(system, own), None if method_name is None else words.configured(method_name)
+        scene = words.one_scene(system, own)
+        chosen = None if method_name is None else words.configured(method_name)
         span = words.interval(scene, t_start, t_end)
         start = None if energy is not None and not y0 else _starts(scene, y0, orbits, seed)
         if direction is not None and direction not in DIRECTIONS:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial, wraps
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, overload
 
 import numpy as np
 import typer
@@ -423,8 +423,16 @@ def _pairs(words: Sequence[str]) -> list[tuple[str, str]]:
     return list(found.items())
 
 
-def state(words: str | None) -> Any:
-    """A state from ``0.3,-0.3,0.3,0.15``, an array; None without any words."""
+@overload
+def state(words: str) -> np.ndarray: ...
+
+
+@overload
+def state(words: None) -> None: ...
+
+
+def state(words: str | None) -> np.ndarray | None:
+    """A state from ``0.3,-0.3,0.3,0.15``; None without any words."""
     if words is None:
         return None
     return np.array([_float("--y0", word) for word in re.split(r"\s*[,\s]\s*", words.strip("[]() "))])

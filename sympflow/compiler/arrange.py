@@ -1,7 +1,7 @@
 """The order of operations: programs written anew, with short chains of few operations.
 
 A compiler keeps the order of additions and products, so that it is ours to choose. Numbers are collected as polynomials
-in *letters*: the inputs, and the values of functions that are no polynomials. What depends on no state is computed once
+in *letters*: the inputs, and the values of functions other than polynomials. What depends on no state is computed once
 for a run and stands in a table. Each polynomial is then nested, m·A + B, by letters and products of two of them, so
 that its longest chain of operations is short: the chains of one trajectory take its time. One shape serves a single
 trajectory and the lanes of registers, so that their bits agree.

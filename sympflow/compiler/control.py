@@ -15,8 +15,19 @@ from typing import Any, NamedTuple
 from sympflow.compiler.numbers import Number
 
 __all__ = [
-    "BOOL", "DOUBLE", "INT", "LOWERED", "POINTER", "Code", "Module", "Rows", "Sweep", "Type", "Value", "Variable",
-]  # fmt: skip
+    "BOOL",
+    "DOUBLE",
+    "INT",
+    "LOWERED",
+    "POINTER",
+    "Code",
+    "Module",
+    "Rows",
+    "Sweep",
+    "Type",
+    "Value",
+    "Variable",
+]
 
 
 class Type(NamedTuple):
@@ -244,7 +255,12 @@ class Code:
         return self._new(result, f"call {result or 'void'} {target}({given})")
 
     def outlined(
-        self, name: str, args: Sequence[Value], body: Callable[..., Any], result: Type | None = None, rare: bool = False
+        self,
+        name: str,
+        args: Sequence[Value],
+        body: Callable[..., Value | None],
+        result: Type | None = None,
+        rare: bool = False,
     ) -> Value:
         """Write a call of a function of its own, made of `body(*arguments)` when it is called first."""
         if not self.module.has(name):
@@ -506,7 +522,11 @@ class Code:
         return [x.value for x in variables]
 
     def when(
-        self, condition: Value, then: Callable[[], Any], otherwise: Callable[[], Any] = tuple, rare: bool = False
+        self,
+        condition: Value,
+        then: Callable[[], Sequence[Value]],
+        otherwise: Callable[[], Sequence[Value]] = tuple,
+        rare: bool = False,
     ) -> list[Value]:
         """Execute one of two bodies, and return its values; `rare` if the first one hardly ever."""
         yes, no, after, before = self._label(), self._label(), self._label(), self._block
@@ -571,7 +591,10 @@ class Sweep:
         self._types: dict[Any, Type] = {}
 
     def get(self, key: Any, d: int, type: Type) -> Value:
-        """The value of a key at the place k + d: read from memory, or put there, and 0 before the first place."""
+        """The value of a key at the place k + d: read from memory when that is met first, unless it is put there.
+
+        A value that is put is 0 for places before the first one where it was.
+        """
         self._types[key] = type
         values = self._values.setdefault(key, {})
         if d not in values:

@@ -405,8 +405,14 @@ def _circle_once(x: Value) -> list[Value]:
     return code.once(("circle", x.name), make)
 
 
-_lowered("sin", inline=ALWAYS)(lambda x: _circle_once(x)[0])
-_lowered("cos", inline=ALWAYS)(lambda x: _circle_once(x)[1])
+@_lowered("sin", inline=ALWAYS)
+def _sin(x: Value) -> Value:
+    return _circle_once(x)[0]
+
+
+@_lowered("cos", inline=ALWAYS)
+def _cos(x: Value) -> Value:
+    return _circle_once(x)[1]
 
 
 @_lowered("tan")
@@ -453,9 +459,19 @@ def _atan(x: Value) -> Value:
 # sign, min, max, mod --------------------------------------------------------------------------------------------------
 
 
-_lowered("sign", inline=ALWAYS)(lambda x: where(x > 0.0, 1.0, where(x < 0.0, -1.0, x)))
-_lowered("min", inline=ALWAYS)(lambda x, y: where(_compare("uno", x, x), x, where(x < y, x, y)))
-_lowered("max", inline=ALWAYS)(lambda x, y: where(_compare("uno", x, x), x, where(x > y, x, y)))
+@_lowered("sign", inline=ALWAYS)
+def _sign(x: Value) -> Value:
+    return where(x > 0.0, 1.0, where(x < 0.0, -1.0, x))
+
+
+@_lowered("min", inline=ALWAYS)
+def _min(x: Value, y: Value) -> Value:
+    return where(_compare("uno", x, x), x, where(x < y, x, y))
+
+
+@_lowered("max", inline=ALWAYS)
+def _max(x: Value, y: Value) -> Value:
+    return where(_compare("uno", x, x), x, where(x > y, x, y))
 
 
 @_lowered("mod")
@@ -463,14 +479,17 @@ def _mod(x: Value, y: Value) -> Value:
     """x − ⌊x/y⌋ y, of the sign of y, as in Python."""
     q = _floor(x / y)
     far = _compare("uge", abs(q), 2.0**52) | _compare("oeq", abs(y), INFINITY)
-    slow = lambda x, y: _mod_of(_by_library(x, y, name="fmod"), y)  # noqa: E731
-    return _guarded("mod", far, _mod_of(_rest(q, y, x), y), x, y, slow=slow)
+    return _guarded("mod", far, _mod_of(_rest(q, y, x), y), x, y, slow=_mod_far)
 
 
 def _mod_of(r: Value, y: Value) -> Value:
     """The remainder of the sign of y."""
     other = ((r.bits ^ y.bits) < 0) & _compare("une", r, 0.0)
     return _signed(where(other, r + y, r), y)
+
+
+def _mod_far(x: Value, y: Value) -> Value:
+    return _mod_of(_by_library(x, y, name="fmod"), y)
 
 
 # the C library, lane by lane ------------------------------------------------------------------------------------------
@@ -491,8 +510,8 @@ for _name in OF_SCIPY:
     _lowered(_name, inline=0)(partial(_by_scipy, name=_name))
 
 
-for _name, (_value, _) in COMPOSED.items():
-    _lowered(_name)(_value)
+for _name, _composed in COMPOSED.items():
+    _lowered(_name)(_composed.value)
 
 # the derivatives of ln Γ, which C has not: Abramowitz and Stegun (1964), 6.3.18 and 6.4.11 from 16 on, below by
 # recurrence, below 1/2 by reflection --------------------------------------------------------------------------------

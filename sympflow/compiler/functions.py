@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -23,9 +23,9 @@ __all__ = ["FUNCTIONS", "Function", "added", "apply", "dot", "fma", "is_zero", "
 class Function:
     """A function of real numbers: of arrays by `numpy`, of tensors by its name in torch or a function of these.
 
-    ``partials(y, *x)``, with its value y: the derivative by each argument. `cost` tells when its value is known, in
-    cycles, the same on every machine, so that programs are. `infix` is its sign between two arguments, as a program
-    prints it.
+    ``partials(y, *x)``, with its value y: the derivative by each argument, 0.0 where there is none. `cost` tells when
+    its value is known, in cycles of a typical processor: the same on every machine, so that programs are. `infix` is
+    its sign between two arguments, as a program prints it.
     """
 
     numpy: Callable[..., Any]
@@ -66,6 +66,11 @@ def _multiply_add(a: Any, b: Any, c: Any) -> Any:
     return a * b + c
 
 
+def _sign(x: Any) -> Any:
+    """The sign of tensors, NaN where they are NaN."""
+    return x.sign().where(~x.isnan(), x)
+
+
 def _polygamma(n: int) -> Function:
     """The n-th derivative of the digamma function."""
 
@@ -94,6 +99,10 @@ def _choice(y: Any, c: Any, a: Any, b: Any) -> tuple[Any, Any, Any]:
 def _power_rule(y: Any, x: Any, n: Any) -> tuple[Any, Any]:
     by_n = 0.0 if isinstance(n, float | int) else apply("mul", y, apply("log", x))
     return apply("mul", n, apply("pow", x, n - 1.0)), by_n
+
+
+def _quotient_rule(y: Any, a: Any, b: Any) -> tuple[Any, Any]:
+    return (1.0 / b, -(y / b)) if not isinstance(a, float | int) else (0.0, -(y * y) * (1.0 / a))
 
 
 def _chosen(sign: float) -> Callable[..., tuple[Any, Any]]:
@@ -141,14 +150,13 @@ FUNCTIONS: dict[str, Function] = {
     "sub": Function(np.subtract, "sub", lambda y, a, b: (1.0, -1.0), 3, "-"),
     "mul": Function(np.multiply, "mul", lambda y, a, b: (b, a), 3, "*"),
     "times": Function(np.multiply, "mul", lambda y, a, b: (b, a), 3, "*"),
-    "div": Function(np.divide, "div", lambda y, a, b: (1.0 / b, -(y / b)) if not isinstance(a, float | int) else (
-        0.0, -(y * y) * (1.0 / a)), 13, "/"),
+    "div": Function(np.divide, "div", _quotient_rule, 13, "/"),
     "neg": Function(np.negative, "neg", lambda y, a: (-1.0,), 1),
     "fma": Function(_multiply_add, _multiply_add, lambda y, a, b, c: (b, a, 1.0), 4),
     "pow": Function(np.power, "pow", _power_rule, 120, "**"),
     "sqrt": Function(np.sqrt, "sqrt", lambda y, x: (0.5 * y * (1.0 / x),), 20),
     "abs": Function(np.abs, "abs", lambda y, x: (apply("sign", x),), 1),
-    "sign": Function(np.sign, lambda x: x.sign().where(~x.isnan(), x), lambda y, x: (0.0,), 4),
+    "sign": Function(np.sign, _sign, lambda y, x: (0.0,), 4),
     "min": Function(np.minimum, "minimum", _chosen(-1.0), 3),
     "max": Function(np.maximum, "maximum", _chosen(1.0), 3),
     "floor": Function(np.floor, "floor", lambda y, x: (0.0,), 8),
@@ -202,31 +210,38 @@ FUNCTIONS: dict[str, Function] = {
     "dawsn": Function(_special("dawsn"), _no_tensors("dawsn"), lambda y, x: (1.0 - 2.0 * x * y,), 200),
 }
 # fmt: on
-COMPOSED: dict[str, tuple[Callable[[Any], Any], Callable[[Any, Any], Any]]] = {
-    "expit": (lambda x: 1.0 / (1.0 + apply("exp", -x)), lambda y, x: y * apply("expit", -x)),
-    "bose": (lambda x: 1.0 / apply("expm1", x), lambda y, x: y * apply("bose", -x)),
-    "softplus": (
+
+
+class Composed(NamedTuple):
+    """A function of x made of others: its `value`, and ``slope(y, x)``, its derivative with its value y."""
+
+    value: Callable[[Any], Any]
+    slope: Callable[[Any, Any], Any]
+
+    def function(self) -> Function:
+        return Function(self.value, self.value, lambda y, x: (self.slope(y, x),), 160)
+
+
+COMPOSED = {
+    "expit": Composed(lambda x: 1.0 / (1.0 + apply("exp", -x)), lambda y, x: y * apply("expit", -x)),
+    "bose": Composed(lambda x: 1.0 / apply("expm1", x), lambda y, x: y * apply("bose", -x)),
+    "softplus": Composed(
         lambda x: apply("max", x, 0.0) + apply("log1p", apply("exp", -abs(x))),
         lambda y, x: apply("expit", x),
     ),
-    "logcosh": (
+    "logcosh": Composed(
         lambda x: abs(x) + (apply("log1p", apply("exp", -2.0 * abs(x))) - math.log(2.0)),
         lambda y, x: apply("tanh", x),
     ),
-    "sech": (lambda x: 1.0 / apply("cosh", x), lambda y, x: -(y * apply("tanh", x))),
-    "csch": (lambda x: 1.0 / apply("sinh", x), lambda y, x: -(y / apply("tanh", x))),
+    "sech": Composed(lambda x: 1.0 / apply("cosh", x), lambda y, x: -(y * apply("tanh", x))),
+    "csch": Composed(lambda x: 1.0 / apply("sinh", x), lambda y, x: -(y / apply("tanh", x))),
 }
-"""Functions of others, with derivatives that do not overflow where parts of them do: of x, and of the value y and x."""
-
-
-def _composed(value: Callable[[Any], Any], slope: Callable[[Any, Any], Any]) -> Function:
-    return Function(value, value, lambda y, x: (slope(y, x),), 160)
-
-
-FUNCTIONS |= {name: _composed(*pair) for name, pair in COMPOSED.items()}
+"""Functions of others, whose derivatives do not overflow where parts of them do."""
+FUNCTIONS |= {name: composed.function() for name, composed in COMPOSED.items()}
 OF_SCIPY = (
-    "gamma", "gammainc", "gammaincc", "jv", "yv", "iv", "kv", "ellipk", "ellipe", "hyp2f1", "expi", "exp1", "dawsn",
-)  # fmt: skip
+    *("gamma", "gammainc", "gammaincc", "jv", "yv", "iv", "kv"),
+    *("ellipk", "ellipe", "hyp2f1", "expi", "exp1", "dawsn"),
+)
 """Functions of `scipy.special` that compiled code calls, at their addresses."""
 SPECIAL = "scipy_special_"  # with which their names in code begin
 

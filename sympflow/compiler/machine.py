@@ -20,7 +20,10 @@ __all__ = ["Host", "address", "compiled", "host"]
 
 
 class Host(NamedTuple):
-    """The processor as LLVM names it; if it is `fused`, and how many doubles a `register` holds."""
+    """The processor that code is made for: `cpu` and `features` as LLVM names them.
+
+    It is `fused` if it multiplies and adds in one instruction; a `register` holds so many doubles.
+    """
 
     cpu: str
     features: str
@@ -53,7 +56,8 @@ _RESOLVED: set[str] = set()
 def compiled(text: str, name: str, signature: Any) -> Any:
     """Return a function of a text of LLVM IR, to be called by ctypes, which lets other threads run meanwhile.
 
-    Machine code is kept in this process and in a folder, SYMPFLOW_CACHE_DIR or the user's, behind its digest.
+    The machine code is kept in this process, and in a folder for the next one: the first of SYMPFLOW_CACHE_DIR and the
+    user's cache directory that can be written. A file there begins with the digest of the rest.
     """
     key = hashlib.sha256("\0".join([text, *map(str, host()), llvm.llvm_version_info.__repr__()]).encode()).hexdigest()
     with _LOCK:

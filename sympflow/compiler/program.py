@@ -76,7 +76,7 @@ class Recording:
             if found is not None:
                 return found
         if name in _COMMUTE:
-            args = tuple(sorted(args, key=lambda x: (1, x.order) if isinstance(x, Traced) else (0, x)))
+            args = tuple(sorted(args, key=_place))
         return self._number(name, args)
 
     def _as_number(self, x: Any) -> Any:
@@ -96,9 +96,22 @@ def _constant(x: Any) -> float:
     raise TypeError(f"a number that is traced cannot be combined with {type(x).__name__}: give floats.")
 
 
+def _place(x: Any) -> tuple[int, float]:
+    """The place of an argument among others: numbers first, then what is traced, in its order."""
+    return (1, x.order) if isinstance(x, Traced) else (0, x)
+
+
 MOST_DERIVED = 5000  # operations through which derivatives of single outputs are taken
 MOST_ROOTS = 8.5  # powers that are written as powers of a root
 _COMMUTE = {"add", "mul", "times", "min", "max", "eq", "and", "or"}
+
+
+def _sum(a: Any, b: Any) -> Any:
+    return b if _is(a, 0.0) else a if _is(b, 0.0) else None
+
+
+def _difference(a: Any, b: Any) -> Any:
+    return a if _is(b, 0.0) else -b if _is(a, 0.0) else 0.0 if a is b else None
 
 
 def _product(a: Any, b: Any, name: str = "mul") -> Any:
@@ -122,6 +135,10 @@ def _quotient(a: Any, b: Any) -> Any:
     if isinstance(b, float) and b != 0:
         return a * (1.0 / b) if _halves(b) else None  # exact
     return 0.0 if _is(a, 0.0) else None
+
+
+def _negative(a: Any) -> Any:
+    return a.args[0] if a.name == "neg" else a.args[1] - a.args[0] if a.name == "sub" else None
 
 
 def _power(x: Any, n: Any) -> Any:
@@ -152,12 +169,12 @@ def _choice(condition: Any, a: Any, b: Any) -> Any:
 
 
 _SIMPLER: dict[str, Callable[..., Any]] = {
-    "add": lambda a, b: b if _is(a, 0.0) else a if _is(b, 0.0) else None,
-    "sub": lambda a, b: a if _is(b, 0.0) else -b if _is(a, 0.0) else 0.0 if a is b else None,
+    "add": _sum,
+    "sub": _difference,
     "mul": _product,
     "times": lambda a, b: _product(a, b, "times"),
     "div": _quotient,
-    "neg": lambda a: a.args[0] if a.name == "neg" else a.args[1] - a.args[0] if a.name == "sub" else None,
+    "neg": _negative,
     "pow": _power,
     "fma": _fused,
     "where": _choice,
@@ -333,7 +350,8 @@ def tangent(outputs: Sequence[Any], x: Sequence[Traced], v: Sequence[Any]) -> li
 def adjoint(program: Program) -> Program:
     """Return the program from the inputs, and from cotangents of the outputs behind them, to those of the inputs.
 
-    In the reverse mode, number by number, or with derivatives by other outputs too, which do not wait: the better one.
+    In the reverse mode, number by number, or with the derivatives of each output by the inputs and by other outputs
+    that it is made of, which do not wait for cotangents: the better one.
     """
     recording, n = program.inputs[0].recording, len(program.outputs)
     cotangents = [recording.input(f"of_{i}") for i in range(n)]

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sympflow.arrays import is_tensor
-from sympflow.compiler.functions import OF_SCIPY, apply
+from sympflow.compiler.functions import COMPOSED, OF_SCIPY, apply
 from sympflow.compiler.program import Program, Recording, Traced, reached, traced
 
 __all__ = ["WEIGHTS", "Chain", "TracedArray", "Untraceable", "trace", "trace_chain"]
@@ -250,8 +250,7 @@ def _logaddexp(x: Any, y: Any) -> Any:
     return apply("max", x, y) + apply("log1p", apply("exp", -abs(x - y)))
 
 
-def _softplus(x: Any) -> Any:
-    return apply("max", x, 0.0) + apply("log1p", apply("exp", -abs(x)))
+_softplus = COMPOSED["softplus"].value
 
 
 def _sinc(x: Any) -> Any:
@@ -299,7 +298,7 @@ ELEMENTS: dict[str, Callable[..., Any]] = {
     "rad2deg": lambda x: x * (180 / math.pi), "degrees": lambda x: x * (180 / math.pi),
     "copysign": lambda x, y: abs(x) * _choose(apply("lt", y, 0.0), -1.0, 1.0),
     "heaviside": lambda x, zero: _choose(apply("eq", x, 0.0), zero, _choose(apply("lt", 0.0, x), 1.0, 0.0)),
-    "logaddexp": _logaddexp, "expit": lambda x: 1.0 / (1.0 + apply("exp", -x)), "log_expit": lambda x: -_softplus(-x),
+    "logaddexp": _logaddexp, "expit": COMPOSED["expit"].value, "log_expit": lambda x: -_softplus(-x),
     "xlogy": lambda x, y: _choose(apply("eq", x, 0.0), 0.0, x * apply("log", y)),
     **{name: _of(name) for name in OF_SCIPY}, **{f"{f}{n}": lambda x, f=f, n=n: apply(f"{f}v", float(n), x)
        for f in "jyik" for n in (0, 1)},
@@ -711,7 +710,12 @@ def _linear_layer(x: Any, weight: Any, bias: Any = None) -> np.ndarray | None:
 
 
 class Chain(NamedTuple):
-    """A function of x (n,): layers (weight, bias), a program of one number between two, others before and behind."""
+    """A function of x (n,): linear layers one after the other, with a function of each number between two of them.
+
+    `first` goes from x to the input of the first layer, each of `between` from one number to one, behind each layer but
+    the last, and `last` from x and the output of the last layer to the value. `layers` are pairs of a weight (to, from)
+    and a bias (to,), or None.
+    """
 
     first: Program
     between: list[Program]
@@ -754,7 +758,10 @@ def _check_inputs(program: Program, inputs: Sequence[Traced]) -> None:
 
 
 def trace(function: Callable[..., Any], names: Sequence[Sequence[str] | str], torch: bool = False) -> Program:
-    """Record a function of arrays, or of tensors, that returns one number; `names` are those of the elements."""
+    """Record a function of arrays, or of tensors (`torch`), which returns one number; `Untraceable` says why not.
+
+    `names` has, for each argument, the names of the elements of an array, or the name of a number.
+    """
     inputs, value = _recorded(_Recorded(), function, names, torch)
     return Program(inputs, [value])
 

@@ -102,7 +102,8 @@ class Chunk:
         States of an orbit from where it failed are NaN.
         """
         times, stepper = self.times, self._stepper
-        most, alike = max(1, MOST_VALUES // self.y0.size), self.t_eval is None and not self.params
+        most = max(1, MOST_VALUES // self.y0.size)
+        alike = self.t_eval is None and not self.params
         kernel = None if stepper is None else stepper.kernel
         if len(times) <= most or not alike or stepper is None or kernel is None or len(self) == 1:
             yield times, self.states(times)

@@ -42,7 +42,7 @@ class _Indicator(Reduction):
     """A chaos indicator, and the time at which it was read."""
 
     name: ClassVar[str]
-    fixed: ClassVar[dict[str, Any]]  # arguments of `indicator` that are no options
+    fixed: ClassVar[dict[str, Any]]  # arguments of `indicator` that are not options
     own_loops: ClassVar[bool] = True
 
     @property

@@ -100,7 +100,8 @@ class Drawn:
 
     def parts(self) -> tuple[Any, ...]:
         """The identity of the states for a store: all of them; of very many the sampler, and states among them."""
-        blocks, most = np.arange(-(-self.n // DRAWN)), MOST_DIGESTED // DRAWN
+        blocks = np.arange(-(-self.n // DRAWN))
+        most = MOST_DIGESTED // DRAWN
         spread = blocks if len(blocks) <= most else np.unique(np.linspace(0, len(blocks) - 1, most).astype(int))
         ends = ((k * DRAWN, min((k + 1) * DRAWN, self.n)) for k in spread.tolist())
         states = [digest(self.states(*part)) for part in ends]

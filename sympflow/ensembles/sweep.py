@@ -141,7 +141,8 @@ def ensemble(
     check_flag("same", same)
     if (resume or same) and store is None:
         raise ValueError(f"`{'resume' if resume else 'same'}` goes on with a `store`: name one.")
-    kept, orbits = reduction(reduce), initial_states(system, y0, n, seed)
+    kept = reduction(reduce)
+    orbits = initial_states(system, y0, n, seed)
     fixed, axes = _axes(system, params)
     first = orbits.states(0, min(len(orbits), SHORTEST_CHUNK))
     integrator = integrator_for(system, method, options, (t0, t1), first, flows=not (fixed or axes))

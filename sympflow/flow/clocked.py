@@ -36,10 +36,12 @@ if TYPE_CHECKING:  # a flow needs it only to be compiled
 class ClockPotential(Potential):
     """Σ_k c_k t^(3+2k) B^(k+1)/(k+1), B the last momentum, of d + 1 degrees of freedom; `numbers` are the c_k."""
 
-    def __init__(self, ndof: int, terms: int, **like: Any) -> None:
+    def __init__(
+        self, ndof: int, terms: int, dtype: torch.dtype = torch.float64, device: torch.device | None = None
+    ) -> None:
         super().__init__()
         self.ndof = ndof
-        self.numbers = nn.Parameter(torch.zeros(terms, **like))
+        self.numbers = nn.Parameter(torch.zeros(terms, dtype=dtype, device=device))
 
     def value(self, t: Time, x: Tensor) -> Tensor:
         B = x[-1]
@@ -84,9 +86,10 @@ class ClockedFlow(SystemFlow):
         terms: int = 8,
         dt: float = 1.0,
         system: HamiltonianSystem | None = None,
-        **like: Any,
+        dtype: torch.dtype = torch.float64,
+        device: torch.device | str | None = None,
     ) -> None:
-        super().__init__(ndof, dt, **like)
+        super().__init__(ndof, dt, dtype, device)
         table = SCHEMES.get(scheme)
         if table is None or not table.symmetric or any(table.gradients) or table.nystrom:
             raise ValueError(f"`scheme` {scheme!r} is not a symmetric one without force gradients: take 'leapfrog'.")

@@ -241,7 +241,7 @@ class FlowMap(KnownFlow, Shown, nn.Module):
     def on_extended(self, extended: HamiltonianSystem) -> Self | None:
         """Return the same maps of a driven system with a coordinate more, of which the momentum is −∫ ∂H/∂t dt.
 
-        None where the functions of a system are no part of the maps.
+        None where the maps do not use the functions of a system.
         """
         return None
 

@@ -5,6 +5,7 @@ Arrays are feature-major, as in `sympflow.flow.potentials`: q and p have shape (
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
@@ -51,7 +52,7 @@ class Layer(nn.Module):
         raise NotImplementedError
 
 
-class OwnLayer(Layer):
+class OwnLayer(Layer, ABC):
     """A layer that takes its numbers and functions from its flow, and moves rows of states by `moved`."""
 
     def __init__(self, flow: Any) -> None:
@@ -63,9 +64,9 @@ class OwnLayer(Layer):
     def flow(self) -> Any:
         return self._of[0]
 
+    @abstractmethod
     def moved(self, t: Time, y: Tensor, back: bool) -> Tensor:
         """φ_t(y), or φ_t⁻¹(y), of rows (N, 2d)."""
-        raise NotImplementedError
 
     def forward(self, t: Time, q: Tensor, p: Tensor, back: bool = False) -> tuple[Tensor, Tensor]:
         q, p = self.moved(t, torch.cat([q, p]).T, back).T.chunk(2)
@@ -105,19 +106,21 @@ class Binding:
         return Binding(self._system, self._made, self._parts)
 
 
-class PotentialLayer(Layer):
-    """A layer that moves p by the impulse of a potential of q, or q by that of one of p."""
+class PotentialLayer(Layer, ABC):
+    """A layer that moves p by the impulse of a potential of q, or q by that of a potential of p."""
 
     def __init__(self, potential: Potential) -> None:
         super().__init__()
         self.potential = potential
         self.ndof = potential.ndof
 
+    @abstractmethod
     def _argument(self, q: Tensor, p: Tensor) -> Tensor:
-        return q if self.kind == "kick" else p
+        """The argument of the potential: q or p."""
 
+    @abstractmethod
     def _moved(self, q: Tensor, p: Tensor, g: Tensor) -> tuple[Tensor, Tensor]:
-        return (q, p - g) if self.kind == "kick" else (q + g, p)
+        """q and p after an impulse g of the potential."""
 
     def forward(self, t: Time, q: Tensor, p: Tensor, back: bool = False) -> tuple[Tensor, Tensor]:
         g = self.potential.impulse(t, self._argument(q, p))
@@ -143,11 +146,23 @@ class Kick(PotentialLayer):
 
     kind = "kick"
 
+    def _argument(self, q: Tensor, p: Tensor) -> Tensor:
+        return q
+
+    def _moved(self, q: Tensor, p: Tensor, g: Tensor) -> tuple[Tensor, Tensor]:
+        return q, p - g
+
 
 class Drift(PotentialLayer):
     """φ_t(q, p) = (q + (∇V(t, p) − ∇V(0, p)), p), the flow of H_t = ∂_tV(t, p)."""
 
     kind = "drift"
+
+    def _argument(self, q: Tensor, p: Tensor) -> Tensor:
+        return p
+
+    def _moved(self, q: Tensor, p: Tensor, g: Tensor) -> tuple[Tensor, Tensor]:
+        return q + g, p
 
 
 LAYERS: dict[str, type[PotentialLayer]] = {layer.kind: layer for layer in (Kick, Drift)}

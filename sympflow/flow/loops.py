@@ -27,7 +27,10 @@ __all__ = ["ClockedFlowKernel", "CollocatedFlowKernel", "PrimedFlowKernel", "Spl
 
 
 class PrimedFlowKernel(Kernel):
-    """Compiled loops of a primed flow on its system; a step h < 0 is the inverse of ψ̄_|h|."""
+    """Compiled loops of a primed flow on its system; a step h < 0 is the inverse of ψ̄_|h|.
+
+    A flow with a processor, ψ̄ = χ ∘ K ∘ χ⁻¹, starts a run by χ⁻¹, makes its steps by K, and applies χ to each output.
+    """
 
     def __init__(self, tables: Tables, system: HamiltonianSystem, compensated: bool = False) -> None:
         system.friction.check_sums(compensated)
@@ -143,7 +146,11 @@ class SplitFlowKernel(Kernel):
 
 
 class ClockedFlowKernel(Kernel):
-    """Compiled loops of a flow with a trained clock, of states [q, t, p, B]: n steps of the clock are n times one."""
+    """Compiled loops of a flow with a trained clock, of states [q, t, p, B] of the transformed system.
+
+    B is constant and nothing depends on t, so n steps of the clock are n times one, added where a state is kept:
+    ``advance(s, B)`` of steps s.
+    """
 
     saves_finite = False
 

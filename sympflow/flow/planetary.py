@@ -100,9 +100,10 @@ class KeplerFlow(SystemFlow):
         dt: float = 1.0,
         periods: Sequence[float] | None = None,
         system: HamiltonianSystem | None = None,
-        **like: Any,
+        dtype: torch.dtype = torch.float64,
+        device: torch.device | str | None = None,
     ) -> None:
-        super().__init__(ndof, dt, **like)
+        super().__init__(ndof, dt, dtype, device)
         self.register_buffer("kicks", torch.zeros(2 * reach, **self._like))
         self.register_buffer("gradients", torch.zeros(n_gradients, **self._like))
         self.periods = None if periods is None else tuple(map(float, periods))

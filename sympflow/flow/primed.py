@@ -55,9 +55,15 @@ class PrimedFlow(PrimedKnown, SystemFlow):
     PLAN = "primed"
 
     def __init__(
-        self, ndof: int, shape: PrimedShape, dt: float = 1.0, system: HamiltonianSystem | None = None, **like: Any
+        self,
+        ndof: int,
+        shape: PrimedShape,
+        dt: float = 1.0,
+        system: HamiltonianSystem | None = None,
+        dtype: torch.dtype = torch.float64,
+        device: torch.device | str | None = None,
     ) -> None:
-        super().__init__(ndof, dt, **like)
+        super().__init__(ndof, dt, dtype, device)
         self.shape = shape
 
         def columns(inside: bool) -> Columns:

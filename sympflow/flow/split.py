@@ -2,7 +2,7 @@
 
     linear    Σ_f s_f(t) E_f(x), E_f the energy of the modes of frequency ω_f, turned by the exact flow
     kick      V(t, q) = w(t) U(A(t) q) − γ(t) ½|∇_q U(A(t) q)|²_{M⁻¹},  A(t) = C φ(t) C⁻¹ a filter of the normal modes
-    shear     the same for a part H_k(q, p) of which no two variables are conjugate, without γ
+    shear     the same for a part H_k(q, p) without two conjugate variables, without γ
 
 in the notation of `sympflow.linear_part` and `sympflow.parts`; s, w, γ and φ are even polynomials in t, times t, t,
 t³ and 1. The impulse method (φ = 1), the mollified impulse (φ = sinc) and Nyström splittings with the exact linear flow
@@ -113,9 +113,10 @@ class SplitFlow(SystemFlow):
         dt: float = 1.0,
         expressions: Sequence[str] | None = None,
         system: HamiltonianSystem | None = None,
-        **like: Any,
+        dtype: torch.dtype = torch.float64,
+        device: torch.device | str | None = None,
     ) -> None:
-        super().__init__(ndof, dt, **like)
+        super().__init__(ndof, dt, dtype, device)
         self.expressions = None if expressions is None else tuple(expressions)
         self.sequence, self.kinds, self.classes = tuple(sequence), tuple(kinds), tuple(classes)
         if not self.sequence or self.sequence != self.sequence[::-1]:
@@ -208,7 +209,7 @@ class SplitFlow(SystemFlow):
         return self._maps.current(lambda: KeptMaps(self._numpy_maps, self._coefficient_maps(), self.dt))
 
     def _numpy_maps(self, t: np.ndarray) -> list[SubFlow]:
-        """The same of an array of times, for the compiled loops; for t < 0 the inverse of ψ̄_|t| (one sign for all)."""
+        """The `maps` of an array of times of one sign, for the compiled loops; for t < 0 of the inverse of ψ̄_|t|."""
         maps = self._assemble(
             lambda column: np.moveaxis(column.at(np.abs(t)), -1, 0), lambda entries: np.stack(entries, axis=-1)
         )
@@ -287,9 +288,15 @@ class SplitFlow(SystemFlow):
             raise ValueError("`force_gradient` needs H = ½ pᵀM⁻¹p + ½ qᵀKq + U(q): leave it out.")
 
     def plan(self) -> dict[str, Any]:
-        told = {"terms": self.terms, "filters": self.filtered, "gradients": list(self.gradient_kicks)}
-        told |= {name: list(getattr(self, name)) for name in ("sequence", "kinds", "classes")}
-        return told | {"expressions": None if self.expressions is None else list(self.expressions)}
+        return {
+            "sequence": list(self.sequence),
+            "kinds": list(self.kinds),
+            "classes": list(self.classes),
+            "terms": self.terms,
+            "filters": self.filtered,
+            "gradients": list(self.gradient_kicks),
+            "expressions": None if self.expressions is None else list(self.expressions),
+        }
 
     @classmethod
     def checked_plan(cls, plan: dict[str, Any], ndof: int) -> dict[str, Any]:

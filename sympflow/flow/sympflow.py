@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 import os
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Self
@@ -14,7 +15,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
 from sympflow.arguments import plain, real_number
-from sympflow.compiler import NotCompiled
+from sympflow.compiler import arrays_only
 from sympflow.flow.families import family
 from sympflow.flow.flow_map import FlowMap
 from sympflow.flow.layers import LAYERS, Binding, Drift, Kick, Layer, PotentialLayer
@@ -261,7 +262,7 @@ class SympFlow(FlowMap):
         Raises
         ------
         TypeError
-            If a layer is no kick or drift with an MLP potential.
+            If a layer is not a kick or drift with an MLP potential.
         """
         found = []
         for layer in self.layers:
@@ -547,7 +548,7 @@ class SympFlow(FlowMap):
         return self._network
 
     def _kept_tensors(self) -> Iterable[Mapping[str, Tensor | None]]:
-        """The tensors that compiled loops are made of, which they are compared with in every run."""
+        """The tensors that compiled loops are made of; each run compares them with those of the run before."""
         return (d for m in self.modules() for d in (m._parameters, m._buffers))
 
     def _loops_for(self, system: HamiltonianSystem) -> Kernel:
@@ -557,7 +558,7 @@ class SympFlow(FlowMap):
         from sympflow.kernels.networks import MLPFlowKernel
 
         if not (potentials := self._potentials()):
-            raise NotCompiled("`flow` has layers other than kicks and drifts with MLP potentials: use backend='array'.")
+            raise arrays_only("`flow` has layers other than kicks and drifts with MLP potentials")
         networks = [V.network(is_kick) for is_kick, V in potentials]
         check_compilable(self.dtype, self.device)
         return MLPFlowKernel(self.ndof, networks)
@@ -627,26 +628,32 @@ class SympFlow(FlowMap):
         return self._closed(q, p, y, t), self._closed(dq, dp, torch.zeros_like(y), 1.0)
 
 
-class SystemFlow(SympFlow):
+class SystemFlow(SympFlow, ABC):
     """A SympFlow whose maps are made of a system's own functions, which its file does not hold."""
 
     PLAN: ClassVar[str]
-    """The name of its plan in a file, which `plan` tells, and `checked_plan` makes arguments of."""
+    """The name of its plan in a file: `plan` writes the plan, `checked_plan` reads it."""
     MADE: ClassVar[str] = "primed with the V and T of a system"
 
-    def __init__(self, ndof: int, dt: float, dtype: Any = torch.float64, device: Any = None) -> None:
+    def __init__(
+        self,
+        ndof: int,
+        dt: float,
+        dtype: torch.dtype = torch.float64,
+        device: torch.device | str | None = None,
+    ) -> None:
         super().__init__(ndof, dt=dt, layers=())
         self._like: dict[str, Any] = {"dtype": checked_dtype(dtype), "device": checked_device(device)}
         self._binding = Binding(None, self.MADE)
 
+    @abstractmethod
     def plan(self) -> dict[str, Any]:
         """The numbers that describe the flow, JSON-able."""
-        raise NotImplementedError
 
     @classmethod
+    @abstractmethod
     def checked_plan(cls, plan: dict[str, Any], ndof: int) -> dict[str, Any]:
-        """Return the arguments of the class that a file describes, all of which are checked."""
-        raise NotImplementedError
+        """Return the arguments of the class that a file describes, after a check of each; `Refused` says why not."""
 
     def architecture(self) -> dict[str, Any]:
         return {"ndof": self.kept_ndof, self.PLAN: self.plan()}
@@ -684,7 +691,8 @@ class SystemFlow(SympFlow):
         return self if self._binding.known else self.bind(system)
 
     def _kept_tensors(self) -> Iterable[Mapping[str, Tensor | None]]:
-        return (self._buffers, *(m._parameters for m in self.modules()))  # the bases of columns are no numbers
+        # Without the buffers of its columns: those are bases of polynomials, which never change.
+        return (self._buffers, *(m._parameters for m in self.modules()))
 
     def _loops_for(self, system: HamiltonianSystem, compensated: bool = False) -> Kernel:
         flow = self.bound(system)

@@ -43,7 +43,15 @@ class PairsHamiltonian(LocalHamiltonian):
     quadratic_kinetic = True
 
     def __init__(
-        self, potential: Any, masses: Any, dim: Any, box: Any, cutoff: Any, softening: Any, params: Any, bodies: Any
+        self,
+        potential: str | sp.Expr,
+        masses: Any,
+        dim: Any,
+        box: Any,
+        cutoff: Any,
+        softening: Any,
+        params: Mapping[str, Any] | None,
+        bodies: Mapping[str, Any] | None,
     ) -> None:
         self.dim = checked_count("dim", plain(dim), 1, MOST_AXES, "1, 2 or 3, the coordinates of a body")
         self.masses = checked_column("masses", masses)
@@ -173,7 +181,12 @@ class PairsHamiltonian(LocalHamiltonian):
         return SymbolicHamiltonian(T + V, {f"{name}_": value for name, value in self.params.items()})
 
     def written_potential(
-        self, q: Sequence[Any], softening: Any, columns: Sequence[Any], c: Mapping[Any, Any], box: Sequence[Any] = ()
+        self,
+        q: Sequence[sp.Expr],
+        softening: sp.Expr,
+        columns: Sequence[Sequence[sp.Expr]],
+        c: Mapping[sp.Symbol, sp.Expr],
+        box: Sequence[sp.Expr] = (),
     ) -> sp.Expr:
         """V of all pairs, in symbols of positions, ε², columns of bodies, parameters and the sides of the box."""
         terms = []
@@ -288,7 +301,8 @@ class PairsHamiltonian(LocalHamiltonian):
         for pairs in self._pairs(q, p / np.repeat(self.inertia, self.dim)):
             x, w = pairs.x
             r, side = np.sqrt(pairs.s), np.sign(x @ ASLANT[: self.dim])
-            speed, across = _dot(w, w), w - (_dot(x, w) / np.maximum(_dot(x, x), TINY))[..., None] * x
+            speed = _dot(w, w)
+            across = w - (_dot(x, w) / np.maximum(_dot(x, x), TINY))[..., None] * x
             straight = (speed > 0) & (_dot(across, across) <= STRAIGHT**2 * speed)
             along = straight.all(0, keepdims=True) if together else straight
             yield pairs.i, pairs.j, np.where(along, side, 1.0) * r, pairs.symbol_values
@@ -317,7 +331,7 @@ class PairsHamiltonian(LocalHamiltonian):
             values = self._values(f"potential {key}", lambda: expressions, names, distances, *symbol_values)
         return [np.broadcast_to(value, distances.shape) for value in values]
 
-    def leapt(self, starts: np.ndarray, ends: np.ndarray, n_steps: Any, conserves: bool) -> np.ndarray:
+    def leapt(self, starts: np.ndarray, ends: np.ndarray, n_steps: int | np.ndarray, conserves: bool) -> np.ndarray:
         """By an energy that is off by more than T + |V| of the start, and a T of more than twice that."""
         pairs = self.n_bodies * (self.n_bodies - 1) // 2
         T0, T = np.square(np.array([starts, ends])[..., self.ndof :]) @ np.repeat(0.5 / self.inertia, self.dim)

@@ -46,7 +46,11 @@ CLOSE = 1e-9  # of the largest value
 
 
 class CallableHamiltonian(Definition):
-    """The functions of a system given by V(q) or H(q, p), as a program where they can be traced: `form`."""
+    """The functions of a system given by V(q) or H(q, p), as a program where they can be traced: `form`.
+
+    They are traced when they are first used, and compared by value with the program. Functions of a driven system take
+    the time first, one number: a float beside arrays, a tensor of one double beside tensors.
+    """
 
     library: str = ""  # "numpy" or "torch", whose arrays the functions take; "" if they fail on both
     untraced: str = ""
@@ -670,7 +674,11 @@ def _time_difference(value: Callable[[Any], Array], t: Any) -> Array:
 
 
 class NumbaFunction:
-    """V, ∇V or ∇²V·v of Numba functions, by the order, for any batch of states; the time comes first."""
+    """V, ∇V or ∇²V·v of Numba functions, by the order, for any batch of states; the time comes first.
+
+    Tensors are taken through NumPy; derivatives of V and of ∇V flow back by ∇V and ∇²V·v, in reverse and forward mode.
+    The Numba functions are V(q), gradient(q, out) and hessian_vector(q, v, out).
+    """
 
     def __init__(self, functions: tuple[Any, Any, Any | None], order: int, times: tuple[float, ...] = ()) -> None:
         self.functions, self.order, self.times = functions, order, times

@@ -57,7 +57,10 @@ def advanced(system: HamiltonianSystem, tableau: Tableau, y: Array, K: Array, h:
 
 
 def stages(system: HamiltonianSystem, tableau: Tableau, y: Array, h: Any, times: Any) -> tuple[Array, int]:
-    """The K (..., s, 2d) of a step, NaN where the step was not solved; and the iterations, over all states."""
+    """The K (..., s, 2d) of a step, NaN where the step was not solved; and the iterations, over all states.
+
+    Of tensors they are solved without a graph, then by `DIFFERENTIATED` more iterations in it, for their derivatives.
+    """
     A, _, scale = (like(c, y) for c in tableau)
     if not is_tensor(y):
         with np.errstate(all="ignore"):

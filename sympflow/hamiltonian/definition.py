@@ -6,14 +6,11 @@ import copy
 from collections.abc import Sequence
 from functools import cached_property
 from math import inf
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from sympflow.arrays import Array
-
-if TYPE_CHECKING:
-    pass
 
 
 def bare_copy(x: Any) -> Any:
@@ -49,7 +46,7 @@ class Definition:
     loops: str = ""  # the compiled loops of a definition by one piece: see `sympflow.hamiltonian.local`
     leaps: bool = False  # bodies may meet, over which a step may leap: then there is `leapt`
     impulses: tuple[Any, ...] = ()  # DiracDelta in t: then there are `between_impulses` and `kicks`
-    poles: Any = None  # the places at which H is infinite or no number, which a step may leap over
+    poles: Any = None  # `Poles`, `TracedPoles` or None: where H is infinite or no number, and steps may leap over
     form: Any = None  # the program of functions that could be traced: see `sympflow.hamiltonian.formulas`
     layered: Any = None  # V with layers whose weights torch follows: see `sympflow.hamiltonian.layered`
     untraced: str = ""  # the reason for which they could not, a clause, known after `form`
@@ -98,7 +95,7 @@ class Definition:
         """∇²V(q)·v: (..., d), each, to (..., d)."""
         return (self.potential_hessian(q, *t) @ v[..., None])[..., 0]
 
-    def leapt(self, starts: np.ndarray, ends: np.ndarray, n_steps: Any, conserves: bool) -> np.ndarray:
+    def leapt(self, starts: np.ndarray, ends: np.ndarray, n_steps: int | np.ndarray, conserves: bool) -> np.ndarray:
         """Return True for each run of steps from states (n, 2d) to others that leapt over an infinite V: (n,)."""
         raise NotImplementedError(f"{type(self).__name__} must define leapt().")
 

@@ -28,10 +28,8 @@ MOST_IN_SYMBOLS = 300  # operations
 MOST_COMPILED = 5000  # operations of a gradient
 _JUMPING = {"sign", "floor", "mod", "where", "lt", "le", "eq", "atan2"}
 _BENDING = {"abs", "min", "max", "asin", "acos"}
-_SINGULAR = {"div": 1} | dict.fromkeys((
-    "pow", "log", "log1p", "tan", "sqrt", "acos", "asin", "acosh", "atanh", "gamma", "lgamma", "digamma", "ellipk",
-    "bose", "csch",
-), 0)  # fmt: skip
+_OF_FIRST = "pow log log1p tan sqrt acos asin acosh atanh gamma lgamma digamma ellipk bose csch"
+_SINGULAR = {"div": 1} | dict.fromkeys(_OF_FIRST.split(), 0)
 """The argument by which an operation is infinite or no number."""
 _AS_THEIR_ARGUMENTS = {"abs", "neg", "sqrt", "pow", "mul", "times"}
 _POLYNOMIAL = {"add", "sub", "mul", "times", "neg", "fma"}
@@ -100,7 +98,10 @@ class Entries:
 
 
 class TracedHamiltonian:
-    """The form of a system of Python functions, as `SymbolicHamiltonian` is that of a system of symbols."""
+    """The form of a system of Python functions, as `SymbolicHamiltonian` is that of a system of symbols.
+
+    The program is V of q, if it is `separable`, or H of q and p; of a driven system the time comes first.
+    """
 
     parameters: tuple[Variable, ...] = ()
     values: tuple[float, ...] = ()

@@ -21,7 +21,7 @@ class Friction:
             rates, self._modes = np.linalg.eigh(damping)
             self.rates = np.maximum(rates, 0.0)  # −0 and what rounding leaves below it
         self.kind = None if damping is None else damping.ndim  # the axes of Γ, by which code for it is made
-        self.isotropic = self.rates.ndim == 0  # Γ = γ, of which the flow is conformally symplectic
+        self.isotropic = self.rates.ndim == 0  # Γ = γ: the flow is conformally symplectic
         self.largest = float(self.rates.max())
 
     def __reduce__(self) -> tuple[Any, ...]:

@@ -28,7 +28,10 @@ REMEDY = "where all is as it should be, pass check=False to HamiltonianSystem."
 
 
 def probe_states(given: np.ndarray | None, domain: Domain | None, width: int) -> np.ndarray:
-    """States (n, width) at which functions are tested: the given ones, near these, and some of the domain."""
+    """States (n, width) at which functions are tested: the given ones, near these, and some of the domain.
+
+    Without any they are random numbers of size 1.
+    """
     rng = np.random.Generator(np.random.PCG64(20260102))
     found = []
     if given is not None:
@@ -178,7 +181,10 @@ def _check_batch(functions: Tested, name: str, x: Array, single: np.ndarray, bat
 
 
 def _directions(x: np.ndarray, chosen: Sequence[int] | None, parts: int, own: bool = False) -> np.ndarray:
-    """Directions (N, m, n) at states (N, n), of the size of these: those of chosen components, or random ones."""
+    """Directions (N, m, n) at states (N, n), of the size of these: those of chosen components, or random ones.
+
+    A small component is moved by a tenth of the largest, or, if it is not 0, by its `own` size.
+    """
     groups = np.abs(x).reshape(len(x), parts, -1)
     largest = groups.max(-1, keepdims=True)
     size = np.maximum(groups, 0.1 * np.where(largest > 0, largest, 1.0))

@@ -28,7 +28,7 @@ NEWTON, FOUND = 20, 1e-12  # steps at most, and the error of a velocity relative
 
 
 def _check_array(name: str, x: Any, what: str) -> None:
-    """Raise a TypeError for what is no array."""
+    """Raise a TypeError unless x is an array or a tensor."""
     if isinstance(x, list | tuple | int | float | str | dict | Shown) and not isinstance(x, np.generic):
         given = type(x).__name__ if isinstance(x, Shown) else repr(x)
         raise TypeError(

@@ -179,7 +179,11 @@ def next_two(X: Any, beta: Any, G2: Any, G3: Any) -> tuple[Any, Any]:
 
 
 def kepler_flow(x: Sequence[Any], v: Sequence[Any], mu: Any, t: Any) -> tuple[Numbers, Numbers]:
-    """Move x and v, three numbers each, over a time t of any sign, about a centre with μ = GM > 0."""
+    """Move x and v, three numbers each, over a time t of any sign, about a centre with μ = GM > 0.
+
+    Ellipses, parabolas and hyperbolas of any eccentricity, as exactly as their conditioning allows; whole periods are
+    left out first.
+    """
     new = [a + b for a, b in zip([*x, *v], kepler_changes(x, v, mu, t), strict=True)]
     return new[:3], new[3:]
 

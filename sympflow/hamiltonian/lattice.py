@@ -140,7 +140,10 @@ class LatticeHamiltonian(LocalHamiltonian):
         }
 
     def wells(self) -> list[np.ndarray]:
-        """The values of the fields (F,) at which all sites are at rest: the lowest minima of U, 0 without U."""
+        """The values of the fields (F,) at which all sites are at rest: the lowest minima of U, 0 without U.
+
+        U is first looked at along straight lines, at fields of all sizes, for the units in which it is minimized.
+        """
         n, rng = len(self.fields), np.random.default_rng(0)
         if self.U == 0:
             return [np.zeros(n)]

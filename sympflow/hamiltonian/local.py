@@ -31,7 +31,11 @@ VECTORS_OF_A_RUN = 12
 
 
 class LocalHamiltonian(Definition, ABC):
-    """H = T(p) + V(q) as a sum over sites and bonds, or over pairs, by one expression for each kind of term."""
+    """H = T(p) + V(q) as a sum over sites and bonds, or over pairs, by one expression for each kind of term.
+
+    A subclass defines `potential`, `potential_gradient`, `hessian_vector`, `third_derivative` and, unless T is
+    quadratic, `kinetic` and its derivatives; all of arrays and tensors (..., d), at the cost of O(d).
+    """
 
     separable = True
     has_third_derivative = True

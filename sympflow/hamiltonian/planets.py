@@ -294,7 +294,10 @@ def newtonian(local: PairsHamiltonian) -> float | None:
 
 
 class PlanetsHamiltonian(PairsHamiltonian):
-    """H = Σ |p_i|²/2m_i − G Σ_{i<j} m_i m_j/r_ij, with a star, body 0: see `HamiltonianSystem.planets`."""
+    """H = Σ |p_i|²/2m_i − G Σ_{i<j} m_i m_j/r_ij, with a star, body 0: see `HamiltonianSystem.planets`.
+
+    Bodies of mass 0 have momenta per unit mass; they feel the others and are not felt.
+    """
 
     noun = "system of planets"
     extra: sp.Expr | None = None
@@ -353,7 +356,10 @@ class PlanetsHamiltonian(PairsHamiltonian):
         return [given[name] for name in self._letters]
 
     def extra_program(self, order: int) -> Program:
-        """The extra potential of a body at x, y, z from the star, with order 0; its slope, and along vectors that."""
+        """The extra potential of a body at x, y, z from the star, with order 0; its slope, and along vectors that.
+
+        The numbers are x, y, z, those of `extra_values`, and the vectors.
+        """
         if order not in self._programs:
             names = [*PLACE[:3], *self._letters, *(f"{name}{k}" for k in range(1, order) for name in PLACE[:3])]
 
@@ -407,7 +413,12 @@ class PlanetsHamiltonian(PairsHamiltonian):
         return "" if self.extra is None or few else "an `extra` potential of many bodies"
 
     def written_potential(
-        self, q: Sequence[Any], softening: Any, columns: Sequence[Any], c: Mapping[Any, Any], box: Sequence[Any] = ()
+        self,
+        q: Sequence[sp.Expr],
+        softening: sp.Expr,
+        columns: Sequence[Sequence[sp.Expr]],
+        c: Mapping[sp.Symbol, sp.Expr],
+        box: Sequence[sp.Expr] = (),
     ) -> sp.Expr:
         V = super().written_potential(q, softening, columns, c, box)
         if self.extra is None:

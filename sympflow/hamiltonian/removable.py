@@ -135,7 +135,7 @@ BOUNDED = {function.__name__: function for function in (expit, bose, softplus, l
 
 
 class hyp2f1(sp.Function):
-    """Gauss's hypergeometric function of three numbers and x, of which elliptic integrals are made."""
+    """Gauss's hypergeometric function of three numbers and x, for the derivatives of elliptic integrals."""
 
     nargs = 4
     is_real = True
@@ -309,7 +309,7 @@ _TAKEN: dict[tuple[type, int], Callable[[sp.Expr], sp.Expr]] = {
 
 
 def _together(wave: sp.Expr, n: sp.Expr, inverse: sp.Expr, m: sp.Expr) -> sp.Expr | None:
-    """waveⁿ · inverseᵐ for those of which one divides by what the other is."""
+    """waveⁿ · inverseᵐ in one expression that does not overflow, where one divides by the other; else None."""
     if not (m.is_number and m.is_positive):
         return None
     if wave == sp.E and isinstance(inverse, expit | bose | sp.sech | sp.csch):  # exp(n)

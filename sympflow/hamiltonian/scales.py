@@ -12,7 +12,7 @@ from sympflow.hamiltonian.definition import bare_copy
 from sympflow.lazy import kept, lately_kept
 
 STATES = 64  # states of a domain at which Hessians are taken, where there is no y0
-MOST_DENSE = 200  # degrees of freedom of lattices and pairs of which steps and Hessians are matrices
+MOST_DENSE = 200  # degrees of freedom of lattices and pairs up to which steps and Hessians are matrices
 SLOW = 0.1  # radians in a step of the system, the rate where nothing in H gives one
 STEP = 0.05  # radians of the fastest motion in a default step
 MOST_RATES = 16  # states of a batch at which rates are taken
@@ -123,7 +123,10 @@ def _fastest_at(system: Any, t: float, y: np.ndarray | None) -> float:
 
 
 def rate_of_motion(system: Any, times: Sequence[float], states: Sequence[np.ndarray]) -> float:
-    """The rate √(|(J∇²H)² ẏ|/|ẏ|) of the motion at states (..., 2d) of times, ω of an oscillation; 0 if not known."""
+    """The rate √(|(J∇²H)² ẏ|/|ẏ|) of the motion at states (..., 2d) of times, ω of an oscillation; 0 if not known.
+
+    Modes that do not move, such as the highest ones of a grid, have no part in it.
+    """
     sizes = np.zeros((2, 1))
     with np.errstate(all="ignore"), suppress(ArithmeticError, ValueError, TypeError):
         for t, y in zip(times, map(_few, states), strict=True) if system.ndof <= MOST_DENSE else ():

@@ -789,7 +789,8 @@ class HamiltonianSystem(Hamiltonian, Answering):
         earlier |= {"_dt": state.get("dt"), "_inverse_mass": state.get("inverse_mass")}
         earlier["local"] = state["definition"] if state["definition"].loops else None
         now = {name: value for name, value in state.items() if name not in ("params", "dt", "inverse_mass")}
-        vars(self).update({**earlier, **now})
+        for name, value in {**earlier, **now}.items():
+            setattr(self, name, value)
 
     @property
     def params(self) -> Mapping[str, float]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -15,9 +15,6 @@ from sympflow.hamiltonian.definition import Definition
 from sympflow.hamiltonian.domain import Domain
 from sympflow.hamiltonian.system import HamiltonianSystem, Parameters, Scene
 from sympflow.lazy import lately_kept
-
-if TYPE_CHECKING:
-    pass
 
 LARGEST_SHIFT = 1e100
 

@@ -331,7 +331,8 @@ def _error(integrator: FixedStep, problem: Problem, tol_of: str, trial: float) -
     def run(h: float, end: float, n: int) -> tuple[np.ndarray, np.ndarray]:
         t = problem.t0 + sign * np.linspace(0.0, end, n + 1)
         with np.errstate(all="ignore"):
-            stepped, piece = replace(integrator, dt=h), replace(problem, t1=float(t[-1]), t_eval=t, diagnosed=False)
+            stepped = replace(integrator, dt=h)
+            piece = replace(problem, t1=float(t[-1]), t_eval=t, diagnosed=False)
             _, jumps = landings(stepped, system, piece.t0, piece.t1, kinks=True)
             outcome = run_in_pieces(lambda *given: (given[0].run(given[1]), given[1]), stepped, piece, jumps)[0]
         nonlocal compiled

@@ -387,7 +387,11 @@ def forward_tangent(
 def differentiated(
     jacobian: Callable[[Any, np.ndarray, np.ndarray], np.ndarray], times: np.ndarray, states: Array, lengths: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A chunk of `steps` as times and lengths (n, ...) and Jacobians (n, ..., k, k)."""
+    """A chunk of `steps` as times and lengths (n, ...) and Jacobians (n, ..., k, k).
+
+    `jacobian` is given the times (n, ...), the states and the lengths. Each step is differentiated in the precision in
+    which it was executed, so its Jacobian holds the rounding of that precision; it is returned as float64.
+    """
     y = to_numpy(states)
     batch = y.shape[:-1]
     t, h = (np.broadcast_to(x.reshape(*x.shape, *[1] * (len(batch) - x.ndim)), batch) for x in (times, lengths))

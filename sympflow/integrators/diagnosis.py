@@ -1,28 +1,28 @@
-"""After a run: over which poles of H it leapt, and when the solution of one that failed becomes infinite."""
+"""After a run: the poles of H and the collisions that it leapt over, steps that are too long, and the time at which the
+solution of a run that failed becomes infinite."""
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import cache, partial
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 from weakref import WeakSet
 
 import numpy as np
 
 from sympflow.arguments import warn
-from sympflow.arrays import Array, finite_states, has_values, is_tensor, masked, one_lane, readable, to_numpy
-from sympflow.hamiltonian.domain import Box, Domain, EnergySublevel
+from sympflow.arrays import Array, is_tensor, masked, readable, to_numpy
 from sympflow.hamiltonian.scales import known_scale, rate_of_motion
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep
 from sympflow.integrators.contract import Integrator, Outcome, Problem
+from sympflow.integrators.domain_exit import check_domain, check_system_along, warn_of_loss
 
 if TYPE_CHECKING:
-    from sympflow.flow.known import KnownFlow
     from sympflow.hamiltonian.parameter_rows import ParameterRows
     from sympflow.hamiltonian.poles import Poles
 
@@ -56,10 +56,6 @@ NO_FORCE = (
     "At the last state the force is NaN: write H without parts that overflow, such as exp(800), or are 0/0; shorter "
     "steps do not help. Start elsewhere"
 )
-STATES_COMPARED, MOST_COMPARED = 16, 64
-"""Outputs of a run, and states of a batch, at which H is compared with that of the flow."""
-MANY_TIMES = 1000.0  # times the certified energy error of a flow beyond which an error outside its domain is warned of
-MANY_STEPS = 100.0  # times the error of one step of a flow without a certificate
 _TOLD: WeakSet[Any] = WeakSet()
 
 
@@ -325,7 +321,14 @@ def _end(
 
 
 def warn_of_long_steps(outcome: Outcome, integrator: Integrator, problem: Problem) -> None:
-    """Warn of what a method doubts, and of steps with which the energy is off by `TOO_LONG` of its size."""
+    """Warn of what a method doubts, and of steps with which the energy is off by `TOO_LONG` of its size.
+
+    Where energy is not kept, the motion at the start and the end must not be too fast for the step. On a clock the
+    energy may be kept although the time is wrong: a run of few steps is compared with one in halves.
+
+    H is evaluated at the start and a few outputs, of large systems at one for every 200 steps, and not in runs of few
+    steps that are not long, which would take twice the time. Its size is ½ Σ|y_i ∂H/∂y_i|, that of an oscillator.
+    """
     system, n, n_steps = problem.system, len(outcome.t), outcome.stats.get("n_steps", 0)
     dt, known, few = None, False, False
     if isinstance(integrator, FixedStep):
@@ -419,7 +422,8 @@ def _energy_off(outcome: Outcome, problem: Problem, seen: int, each: bool) -> fl
 
 def _end_off(outcome: Outcome, integrator: FixedStep, problem: Problem) -> float:
     """How far a run with half the step ends from an outcome, over the size of q or p; 0 where that is not known."""
-    end, half = float(outcome.t[-1]), replace(integrator, dt=0.5 * integrator.step_length(problem.system))
+    end = float(outcome.t[-1])
+    half = replace(integrator, dt=0.5 * integrator.step_length(problem.system))
     again = half.run(replace(problem, t1=end, t_eval=np.array([end]), events=None, progress=None))
     if _failed(again) or not len(again.t):
         return 0.0
@@ -627,52 +631,6 @@ def note_singularities_of_rows(sol: Any, integrator: Integrator, problem: Proble
         sol.message += f" A solution itself becomes infinite, at about t = {times[first]:.10g}: end `t_span` before."
 
 
-# trained flows and leaps ----------------------------------------------------------------------
-
-
-def _surely_within(flow: KnownFlow | None, system: HamiltonianSystem, y: np.ndarray, slack: float) -> bool:
-    """True if all states y (..., 2d) are in the domain of the flow and compiled code can tell."""
-    domain = (None if flow is None else flow.domain) or system.domain
-    if type(domain) is not EnergySublevel and type(domain) is not Box:
-        return False
-    return _compiled()(system, domain, y, slack)
-
-
-@cache
-def _compiled() -> Callable[..., bool]:
-    from sympflow.kernels.passes import all_within
-
-    return all_within
-
-
-def _domain(flow: KnownFlow | None, system: HamiltonianSystem) -> Domain | None:
-    return system.domain if flow is None else flow.domain_for(system)
-
-
-def check_system_along(outcome: Outcome, integrator: Integrator, system: HamiltonianSystem, y0: Array) -> None:
-    """A trained flow must have run on its own system: H is compared at the start and at a few states of the run."""
-    identity = integrator.identity_for(system)
-    if identity is None or identity.is_proved(system):
-        return
-    if not has_values(outcome.y):
-        return
-    width = 2 * system.ndof
-    y = one_lane(outcome.y)
-    chosen = y[np.linspace(0, len(y) - 1, min(len(y), STATES_COMPARED)).astype(int)].reshape(-1, width)
-    starts = one_lane(y0).reshape(-1, width)
-    rows = [states[:: max(1, len(states) // MOST_COMPARED)] for states in (starts, chosen)]
-    states = np.concatenate(rows).astype(float)
-    states = states[np.isfinite(states).all(-1)]
-    first = identity.first_difference(system, states)
-    if first is None:
-        return
-    shown = ", ".join(f"{x:.6g}" for x in states[first][:8]) + (", …" if width > 8 else "")
-    raise ValueError(
-        f"`system` {system.name!r} is not the one that the flow was trained for: at the state ({shown}) of this run "
-        "its H is another. Pass the flow of this system, or train one with sympflow.train(system)."
-    )
-
-
 def warn_of_leap(outcome: Outcome, system: HamiltonianSystem, y0: Array) -> bool:
     """Warn, and return True, of a run that leapt over a singularity of V, and goes on with any energy."""
     n, width = len(outcome.t), 2 * system.ndof
@@ -697,99 +655,3 @@ def warn_of_leap(outcome: Outcome, system: HamiltonianSystem, y0: Array) -> bool
         RuntimeWarning,
     )
     return True
-
-
-def warn_of_loss(outcome: Outcome, integrator: Integrator, system: HamiltonianSystem, y0: Array) -> None:
-    """Warn of a run that left the domain of its flow and lost far more energy than the flow does inside."""
-    flow = integrator.known_flow(system)
-    if flow is None or "domain_exit" not in outcome.stats or not system.keeps_energy:
-        return
-    width = 2 * system.ndof
-    with np.errstate(all="ignore"):
-        y = to_numpy(outcome.y if readable(outcome.y) else outcome.y[-1:])
-        y = y[:: -max(1, len(y) // LOOKED_AT)]
-        H0, H = system.hamiltonian(to_numpy(y0).reshape(-1, width)), system.hamiltonian(y.reshape(len(y), -1, width))
-        error = np.fmax.reduce(np.abs(H - H0) / (system.energy_scale or np.maximum(np.abs(H0), np.abs(H))))
-    certificate, figures = flow.certified, flow.figures
-    known, held, times = "has an error in one step of", figures.get("one_step_error_max") or 0.0, MANY_STEPS
-    if certificate is not None:
-        held = certificate.relative_limit or certificate.relative_energy_error.largest
-        known, times = "is certified for", MANY_TIMES
-    off = error > times * held
-    if not (held and off.any()):
-        return
-    row = int(np.argmax(np.where(off, error, 0)))
-    which = "" if len(off) == 1 else f" of trajectory {row}, the worst of {off.sum()} such,"
-    warn(
-        f"The state left the domain of the flow at t = {outcome.stats['domain_exit']:.10g}, and the relative energy "
-        f"error{which} is {error[row]:.2g}: the flow {known} {held:.2g} inside. "
-        "Start inside its `domain`, train a flow on one that holds these states, or take a scheme such as 'srkn11b'.",
-        RuntimeWarning,
-    )
-
-
-def check_start(flow: KnownFlow, system: HamiltonianSystem, y0: Array, compiled: bool) -> None:
-    """A flow that is taken for its accuracy must start where its accuracy was measured."""
-    if compiled and _surely_within(flow, system, y0, 0.0):
-        return
-    domain = _domain(flow, system)
-    if domain is None:
-        return
-    if not readable(y0):
-        raise ValueError(
-            "`tol` needs the values of y0, to see that it is in the domain of the flow, and torch.func.vmap and "
-            "torch.compile hide them: pass the flow itself, as `flow`."
-        )
-    inside = np.asarray(domain.contains(y0))
-    if not inside.all():
-        which = f" (trajectory {', '.join(map(str, np.argwhere(~inside)[0].tolist()))})" if inside.ndim else ""
-        raise ValueError(
-            f"`y0` is outside the domain{which} that the flow with Δt = {flow.dt:g} was trained and measured on, so it "
-            "has no known accuracy to meet `tol` there: start inside, or train a flow there and pass flow=flow."
-        )
-
-
-def check_domain(outcome: Outcome, integrator: Integrator, system: HamiltonianSystem, action: str) -> None:
-    """Note the first output outside the domain, or end the run there."""
-    flow = integrator.known_flow(system)
-    slack = 0.0 if flow is None else float(flow.figures.get("energy_error_max") or 0.0)
-    if outcome.stats.get("backend") == "compiled" and _surely_within(flow, system, outcome.y, slack):
-        return
-    domain = _domain(flow, system)
-    if domain is None or not len(outcome.t):
-        return
-    inside = np.asarray(domain.contains(outcome.y, slack=slack))  # (n, ...)
-    if inside.all():
-        return
-    with np.errstate(invalid="ignore"):
-        inside = inside | ~finite_states(outcome.y)  # what has become non-finite is reported as that
-    if inside.all():
-        return
-    first = int(np.argmin(inside.reshape(len(inside), -1).all(1)))
-    t = float(outcome.t[first])
-    outcome.stats["domain_exit"] = t
-    which = ""
-    if inside.ndim > 1:
-        index = tuple(np.argwhere(~inside[first])[0].tolist())
-        count = int((~inside).any(0).sum())
-        which = f" (trajectory {', '.join(map(str, index))}, the first of {count})"
-    note = f"The state left the domain at t = {t:.15g}{which}"
-    if action == "warn":
-        worth = ""
-        if flow is not None and not any(flow.evaluations(1, 1, 0, "array").values()):  # else forces of the system
-            worth = (
-                ", where its network was not trained: it stays finite, even past a singularity, and what it gives from "
-                "that time on means nothing. Start inside the domain, or use a classical method"
-            )
-        held = "the figures" if flow is None or flow.certified is None else "the figures and the certificate"
-        outcome.message += f" {note}: {held} of a trained flow do not hold there{worth}."
-        return
-    outcome.message = f"{note}. Start inside the domain, or pass on_domain_exit='warn'."
-    if inside.ndim == 1:
-        outcome.t, outcome.y = outcome.t[: first + 1], outcome.y[: first + 1]
-        outcome.status = -1
-        return
-    outside = np.logical_or.accumulate(~inside, axis=0)
-    after = np.concatenate([np.zeros_like(outside[:1]), outside[:-1]])  # the exit itself is kept
-    outcome.status = np.where(outside[-1], -1, outcome.status)
-    outcome.y = masked(outcome.y, after[..., None], np.nan)

@@ -28,7 +28,7 @@ from sympflow.integrators.clocks import (
     transformed_system,
 )
 from sympflow.integrators.contract import Failure, Outcome, Problem, Steps
-from sympflow.integrators.diagnosis import check_start
+from sympflow.integrators.domain_exit import check_start
 from sympflow.integrators.grid_runs import grid_run
 from sympflow.integrators.registry import is_flow
 from sympflow.integrators.steppers import ArraySteps, Stepper, compiled_loops, rollout

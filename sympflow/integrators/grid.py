@@ -14,7 +14,7 @@ MOST_OPEN_STEPS = 1_000_000
 
 
 def open_end(t0: float, t1: float, dt: float) -> float:
-    """Return t1, or for an infinite one the end of `most` steps of length dt."""
+    """Return t1, or for an infinite one the end of `MOST_OPEN_STEPS` steps of length dt."""
     return t1 if math.isfinite(t1) else t0 + math.copysign(MOST_OPEN_STEPS * dt, t1)
 
 
@@ -78,7 +78,10 @@ class Grid:
 
 
 class Outputs:
-    """The outputs of a run by their numbers 0 … n − 1, of which a part is made at a time."""
+    """The outputs of a run by their numbers 0 … n − 1; a part of them is made at a time.
+
+    These are the times of `t_eval`, or those of every `save_every`-th step and the end.
+    """
 
     def __init__(self, grid: Grid, t_eval: np.ndarray | None, save_every: int) -> None:
         self.grid, self.t_eval, self.every = grid, t_eval, save_every

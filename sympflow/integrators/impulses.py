@@ -63,14 +63,14 @@ def landings(
         bends = system.jump_times(min(t0, t1), max(t0, t1), step, True)
         if len(_within(bends, t0, dt)) and len(bends) <= MOST_KINKS:
             cuts.insert(0, (sorted({*bends.tolist(), *times}), True))
-    for met, bent in cuts:  # all times are known, of which the first ones may be listed
+    for met, bent in cuts:  # all times must be known: `jump_times` may list the first ones alone
         if 0 < len(met) <= MOST_LANDINGS and not len(system.jump_times(max(met), max(t0, t1), step, bent)):
             return "", met
     return said, []
 
 
 def _within(times: Any, t0: float, dt: float) -> np.ndarray:
-    """The times (n,) that are no ends of steps from t0."""
+    """The times (n,) that lie within steps from t0, not at their ends."""
     t = np.array(times)
     x = (t - t0) / dt
     return t[np.abs(x - np.round(x)) > np.maximum(1e-9, 8 * EPS * np.maximum(abs(t0), np.abs(t)) / dt)]
@@ -190,7 +190,10 @@ def _merged(found: list[Outcome], problem: Problem, pieces: list[Any], impulses:
 
 @dataclass(frozen=True)
 class PiecewiseSolution:
-    """The dense output of a run in pieces: that of the piece in which t lies, at an impulse the later one."""
+    """The dense output of a run in pieces: that of the piece in which t lies, at an impulse the later one.
+
+    `spans` (n, 2) are their ends, which decrease in a run back in time.
+    """
 
     pieces: tuple[Callable[[Any], Array], ...]
     spans: np.ndarray

@@ -43,7 +43,10 @@ END = 1e-9
 
 @dataclass(frozen=True)
 class Clock:
-    """A time in which steps are equal, with the traits of the contract that depend on it."""
+    """A time in which steps are equal, with the traits of the contract that depend on it.
+
+    `on` makes of a method and a system the method on the clock; None for the physical time, which needs none.
+    """
 
     on: Callable[[Splitting, HamiltonianSystem], LogarithmicClock] | None = None
     finds_events: bool = True

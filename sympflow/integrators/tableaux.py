@@ -12,7 +12,10 @@ Row = tuple[float, ...]
 
 @dataclass(frozen=True)
 class Tableau:
-    """Stages K_i = f(y + h Σ_j A_ij K_j), the step y + h Σ_i B_i K_i, and some have weights of its `middle`."""
+    """Stages K_i = f(y + h Σ_j A_ij K_j) and the step y + h Σ_i B_i K_i.
+
+    The state in the `middle` of a step is y + h Σ_i middle_i K_i, where these weights are known.
+    """
 
     A: tuple[Row, ...]
     B: Row

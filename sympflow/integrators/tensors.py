@@ -42,7 +42,10 @@ def stepped(stepper: Any, y: Tensor, h: Any, t: Any) -> Tensor:
 
 
 class MovingTimes:
-    """Times of a run that torch follows: outputs move along the field with them, and starts against it."""
+    """Times of a run that torch follows: outputs move along the field with them, and starts against it.
+
+    This is the derivative of the solution, and that of a step of a method of order p up to O(hᵖ).
+    """
 
     def __init__(self, t_span: Any, t_eval: Any) -> None:
         self._ends = (None, None) if t_span is None else tuple(t_span)

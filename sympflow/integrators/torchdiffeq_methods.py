@@ -346,7 +346,7 @@ class Adaptive(Watched, RungeKutta):
     that can reach their end do. Without `t_eval` the
     states are reported every `system.dt`. Between the steps, for outputs, events and the dense output alike, the state
     is a polynomial through both ends with their slopes: of "dopri5" torchdiffeq's quartic, through the middle as well,
-    and of "dopri8" that of degree 7, through steps to the thirds, of which torchdiffeq's quartic is far less exact.
+    and of "dopri8" that of degree 7, through steps to the thirds: torchdiffeq's own quartic is far less exact.
 
     Parameters
     ----------

@@ -161,7 +161,8 @@ class Comparison:
         probes = []
         for k in range(max(3, -(-kinds // len(rows)))):
             kind = (np.arange(len(rows)) + k * len(rows)) % kinds
-            states, inside = rows + moves[np.minimum(kind, len(moves) - 1)], kind >= len(moves)
+            states = rows + moves[np.minimum(kind, len(moves) - 1)]
+            inside = kind >= len(moves)
             states[inside] = within[kind[inside] - len(moves)]
             probes.append(states.reshape(y0.shape))
         return probes

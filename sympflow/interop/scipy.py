@@ -304,7 +304,8 @@ class FlowOutput(DenseOutput):
 
     def _call_impl(self, t: np.ndarray) -> np.ndarray:
         times = np.atleast_1d(t).astype(float)
-        states, h = np.repeat(self._anchor[None], len(times), axis=0), times - self._t_anchor
+        states = np.repeat(self._anchor[None], len(times), axis=0)
+        h = times - self._t_anchor
         moving = (h != 0) & (times != self.t)
         states[times == self.t] = self._y
         if moving.any():

@@ -236,11 +236,12 @@ def _trained(values: Tensor) -> bool:
 def leaves(values: Tensor) -> list[Tensor]:
     """The leaves of the graph on which values depend, such as a network's weights."""
     found: list[Tensor] = []
-    waiting, met = [values.grad_fn], set()
+    waiting: list[Any] = [values.grad_fn]
+    met: set[Any] = set()
     while waiting:
         if (node := waiting.pop()) is not None and node not in met:
             met.add(node)
-            found += [node.variable] if hasattr(node, "variable") else []
+            found += [node.variable] if node.name().endswith("AccumulateGrad") else []
             waiting += [parent for parent, _ in node.next_functions]
     return found
 

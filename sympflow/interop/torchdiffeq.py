@@ -263,7 +263,8 @@ def odeint_adjoint(
         given = tuple(func.parameters())
 
     def make_path(integrator: FixedStep, system: HamiltonianSystem | None, y: Tensor, *more: Any, **named: Any) -> Path:
-        start, learns = float(one_lane(t)[0]), system is not None and system.learns(y)
+        start = float(one_lane(t)[0])
+        learns = system is not None and system.learns(y)
         field = [system.vector_field(unfollowed(y), start)] if system is not None and learns else []
         parameters = (*(given or ()), *(leaf for slope in field if adjoint_params is None for leaf in leaves(slope)))
         flow = integrator.flow_for(system)  # type: ignore[arg-type]
@@ -311,7 +312,8 @@ def _theirs(run: Any, func: Any, y0: Any, *where: Any, over: Any, endless: bool 
     except ValueError as error:
         if not str(error).startswith("Invalid method"):
             raise
-        name, known = str(error).split('"')[1], sorted({*available(), *_THEIRS})
+        name = str(error).split('"')[1]
+        known = sorted({*available(), *_THEIRS})
         hint = did_you_mean(name.lower(), known)
         raise ValueError(f"`method` {name!r} is unknown.{hint} Choose one of {', '.join(known)}.") from None
 
@@ -376,7 +378,8 @@ def _with_jumps(t: Tensor, length: float | None, jumps: np.ndarray) -> Tensor:
     if length is not None:
         n_steps = math.ceil(float(abs(t[-1] - t[0])) / length)
         grid = torch.cat([t[0] + torch.arange(n_steps).to(t) * torch.sign(t[-1] - t[0]) * length, t[-1:]])
-    at, near = torch.as_tensor(jumps).to(t), 1e-9 * (grid[1:] - grid[:-1]).abs().min()
+    at = torch.as_tensor(jumps).to(t)
+    near = 1e-9 * (grid[1:] - grid[:-1]).abs().min()
     apart = ((grid[1:-1, None] - at).abs() > near).all(-1)
     return torch.cat([grid[:1], torch.cat([grid[1:-1][apart], at]).sort(descending=bool(t[-1] < t[0]))[0], grid[-1:]])
 
@@ -580,7 +583,8 @@ class _Solver:
         self.direction, shapes, announced = 1, None, func
         while type(func).__module__.startswith("torchdiffeq"):
             self.direction = -1 if type(func).__name__ == "_ReverseFunc" else self.direction
-            shapes, func = getattr(func, "shapes", shapes), func.base_func
+            shapes = getattr(func, "shapes", shapes)
+            func = func.base_func
         integrator, system = _build(func, self.method, options)
         self.y0, self.shapes, self.func = y0, shapes, func
         self.integrator, self.system = integrator, system

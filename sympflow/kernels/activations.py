@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from sympflow.compiler.functions import apply, fma
+from sympflow.compiler.functions import COMPOSED, apply, fma
 from sympflow.compiler.program import Program, gradient, traced
 
 __all__ = ["SLOPES", "bent"]
-
-LOG_2 = 0.6931471805599453
 
 
 def _logistic(a: Any) -> Any:
@@ -28,11 +26,6 @@ def _sigmoid(a: Any) -> tuple[Any, Any]:
     return h, h * (1.0 - h)
 
 
-def _logcosh(a: Any) -> tuple[Any, Any]:
-    size = abs(a)
-    return size + apply("log1p", apply("exp", -2.0 * size)) - LOG_2, apply("tanh", a)
-
-
 def _swish(a: Any) -> tuple[Any, Any]:
     s = _logistic(a)
     h = a * s
@@ -43,8 +36,8 @@ SLOPES: dict[str, Callable[[Any], tuple[Any, Any]]] = {
     "tanh": _tanh,
     "sin": lambda a: (apply("sin", a), apply("cos", a)),
     "sigmoid": _sigmoid,
-    "softplus": lambda a: (apply("max", a, 0.0) + apply("log1p", apply("exp", -abs(a))), _logistic(a)),
-    "logcosh": _logcosh,
+    "softplus": lambda a: (COMPOSED["softplus"].value(a), _logistic(a)),
+    "logcosh": lambda a: (COMPOSED["logcosh"].value(a), apply("tanh", a)),
     "swish": _swish,
 }
 """The activations by name: functions of a number a that return σ(a) and σ'(a)."""

@@ -15,6 +15,7 @@ from sympflow.compiler.control import INT, POINTER, Rows, Value
 from sympflow.compiler.functions import added, fma
 from sympflow.compiler.program import gradient, traced
 from sympflow.hamiltonian.formulas import Variable
+from sympflow.hamiltonian.monomials import Monomials
 from sympflow.kernels.runs import Room
 from sympflow.kernels.splittings import Splitting, SplittingCode
 
@@ -125,10 +126,17 @@ def term_code(splitting: Splitting) -> ArrayCode:
 
 
 def function_code(
-    ndof: int, gradient: Any, hessian_vector: Any, inverse_mass: Any, driven: bool, friction: int | None, *kick: Any
+    ndof: int,
+    gradient: Any,
+    hessian_vector: Any | None,
+    inverse_mass: np.ndarray | None,
+    driven: bool,
+    friction: int | None,
+    level: int,
+    compensated: bool,
+    monomials: Monomials,
 ) -> ArrayCode:
-    """The compiled functions of a system by Numba functions, for a `kick`: its level, compensated, its monomials."""
-    level, compensated, monomials = kick
+    """The compiled functions of a system that is given by Numba functions, of so many degrees of freedom."""
     forces = Functions(gradient, hessian_vector if level else None, inverse_mass, driven)
     return ArrayCode(FunctionSplitting(level, monomials, compensated, friction, ndof=ndof, timed=driven), forces)
 
@@ -151,7 +159,10 @@ class FunctionSplitting(Splitting):
 
 
 def addressed(function: Any, along: bool, timed: bool) -> Any:
-    """A Numba function, which may take v (`along`) and t (`timed`), as C calls it: with t, q, v, out and a length."""
+    """A Numba function of arrays as one that C can call, with t, places q, v, out and their length.
+
+    What the function raises makes its result NaN. `along` is true of one that takes v, `timed` of one that takes t.
+    """
     from numba import carray, cfunc, njit, types
 
     calls = {

@@ -1,4 +1,8 @@
-"""Compiled linear algebra of Gauss–Newton steps: small dense matrices, on one thread, of Jacobians by columns."""
+"""Compiled linear algebra of Gauss–Newton steps: small dense matrices, on one thread.
+
+The Jacobian comes by columns. It is factored in chunks of rows that stay in the cache: Householder reflections fold one
+chunk after the other into the triangle above it.
+"""
 
 from __future__ import annotations
 
@@ -16,11 +20,12 @@ from sympflow.kernels.runs import begun, finished
 __all__ = ["bent", "damped", "factored"]
 
 WIDTHS = 32, 8, 1  # numbers that are added up together: as many as there are left
-Array = np.ndarray
 CHUNK = 128  # rows that are folded together
 
 
-def factored(columns: Array, blocks: Array, r: Array, scale: Array) -> tuple[Array, Array]:
+def factored(
+    columns: np.ndarray, blocks: np.ndarray, r: np.ndarray, scale: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the triangle R (n + 1, n + 1) of [J r], and the larger of `scale` (n,) and the norms of the columns of J.
 
     J is given by columns (n, m); or in as many blocks of rows as `blocks` (B, k, n) are, each the rows of the columns
@@ -51,7 +56,15 @@ def damped(R: np.ndarray, D: np.ndarray, damping: float) -> tuple[np.ndarray, np
 
 
 def bent(
-    columns: Array, blocks: Array, r: Array, probed: Array, probe: float, step: Array, S: Array, D: Array, curved: float
+    columns: np.ndarray,
+    blocks: np.ndarray,
+    r: np.ndarray,
+    probed: np.ndarray,
+    probe: float,
+    step: np.ndarray,
+    S: np.ndarray,
+    D: np.ndarray,
+    curved: float,
 ) -> np.ndarray:
     """Return the geodesic acceleration, from the errors `probed` a share `probe` of the step away; 0 if too large."""
     (k, m), n = columns.shape, len(D)

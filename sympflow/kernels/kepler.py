@@ -257,7 +257,13 @@ class KeplerCode(Rollouts):
         return [p - q for p, q in zip(a, program(*h, *given), strict=True)]
 
     def _accelerations(
-        self, room: Room, x: list[Vectors], c: list[dict[str, Value]], inverses: Vectors, kick: Value, watch: Any = None
+        self,
+        room: Room,
+        x: list[Vectors],
+        c: list[dict[str, Value]],
+        inverses: Vectors,
+        kick: Value,
+        watch: Callable[[Value, list[Vectors]], Value] | None = None,
     ) -> tuple[list[Vectors], Value]:
         """The accelerations by the interaction, and the length of the kick, which is NaN where planets met."""
         code, groups, zero = room.code, range(self.groups), room.code.constant(0.0, REGISTER)
@@ -578,7 +584,10 @@ def kepler_loops(frame: Frame) -> KeplerLoops:
 
 
 class KeplerKernel(Kernel):
-    """The compiled loops of a scheme of kicks by the interaction and Kepler's drifts, with a processor or none."""
+    """The compiled loops of a scheme of kicks by the interaction and Kepler's drifts, with or without a processor.
+
+    `before` and `after` are the processor and its inverse; empty for none.
+    """
 
     def __init__(
         self,

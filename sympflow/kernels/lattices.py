@@ -43,7 +43,8 @@ class Form:
     """All that the code of a lattice depends on: not its size, nor the values of parameters.
 
     The terms are T ("kinetic"), U ("site") and V by their distances, with their letters; `directions` those of v and w,
-    `arrays` those of c with a value at each site. The boundary is that of each axis, of the lanes last.
+    `arrays` those of c with a value at each site. The boundary is that of each axis, of the lanes last. With friction
+    −γp (`damped`) a column has two more numbers. `even` slabs are alike.
     """
 
     terms: tuple[tuple[Any, tuple[Any, tuple[Any, ...]]], ...]
@@ -59,8 +60,17 @@ class Form:
     even: bool
 
     @classmethod
-    def of(cls, lattice: LatticeHamiltonian, order: Sequence[int], *more: Any) -> Form:
-        """The form of a lattice whose axes are taken in an order, and what else code depends on."""
+    def of(
+        cls,
+        lattice: LatticeHamiltonian,
+        order: Sequence[int],
+        level: int,
+        compensated: bool,
+        damped: bool,
+        width: int,
+        even: bool,
+    ) -> Form:
+        """The form of a lattice whose axes are taken in an order."""
         terms: dict[Any, Any] = {"kinetic": (lattice.T, lattice.p)}
         if lattice.U != 0:
             terms["site"] = lattice.U, lattice.x
@@ -69,7 +79,7 @@ class Form:
         arrays = frozenset(s for s, value in values if isinstance(value, np.ndarray))
         given = tuple(terms.items()), (*lattice.v, *lattice.w), lattice.c, arrays, lattice.inverse_mass is None
         boundary = tuple(lattice.boundary[axis] for axis in order)
-        return cls(*given, boundary, *more)
+        return cls(*given, boundary, level, compensated, damped, width, even)
 
     @property
     def fields(self) -> int:
@@ -150,7 +160,7 @@ class Potential:
         self.slopes, self.bends, self.bent = (Program(given, values) for values in (slopes, bends, bent))
 
     def kept(self, costly: bool) -> list[int]:
-        """The second derivatives that are no constants, of those that are alike the first; or the costly ones alone."""
+        """The second derivatives that are not constant, of those that are alike the first; or the costly ones alone."""
         found: dict[int, int] = {}
         for k, f in enumerate(self.bends.outputs):
             needs = reached([f])
@@ -920,7 +930,7 @@ class LatticeCode(SharedRollouts):
         found = np.zeros(threads, dtype=np.int64)
         shared = [address(x) for x in (meeting, stop, found)]
         contexts = slabs.contexts([*map(address, rooms)], [*map(address, helpers)], block, shared)
-        return lambda k: (rooms[k], contexts[k], (slabs, helpers, found))
+        return lambda k: Member(rooms[k], contexts[k], (slabs, helpers, found))
 
 
 WORTH_A_PIECE = 16_384

@@ -281,7 +281,8 @@ def _flat(x: Any) -> list[Value]:
 class _Points:
     """The code of blocks of points: their way through all layers, and back.
 
-    Arguments are addresses of weights, kinds, times, states, constants, `more`, memory; sizes, blocks and flags.
+    The function takes the addresses of weights, kinds of layers, times, states, constants, `more` others, then of
+    memory; the numbers of layers and of points, the first and the last block, then flags.
     """
 
     def __init__(self, code: Code, sizes: _Sizes, activation: str, velocity: bool, more: int) -> None:

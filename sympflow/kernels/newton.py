@@ -209,7 +209,10 @@ class _Iteration:
                 self.M[row + unknown] = self.M[row + unknown] + 1.0
 
     def pulled(self, end: Sequence[Any], slopes: bool) -> list[Any]:
-        """The cotangents λ + Σ_i v_i of y, where Aᵀv = μ − Bλ for μ of the transposed equations; of parameters."""
+        """The cotangents of y, and with `slopes` of the parameters, for those λ of the state after the step.
+
+        The transposed equations give μ; the cotangents of y are λ + Σ_i v_i, where Aᵀv = μ − Bλ.
+        """
         n, d, N, wide, method = self.n, self.d, self.N, self.wide, self.method
         weights = method.tableau[1]
         if method.damped:
@@ -511,7 +514,10 @@ class _InMemory(NewtonCode):
 
 
 def _solve(M: Value, sizes: Value, N: int, wide: int) -> None:
-    """Eliminate the unknowns in place, pivots in units of their sizes: the last column of M becomes the solution."""
+    """Eliminate the unknowns in place: the last column of M becomes the solution.
+
+    Pivots are the largest of their column in units of the sizes of the unknowns; their reciprocals are `sizes`.
+    """
     code, type = M.code, Type("double", ABREAST)
     with code.over(N) as k:
         row = code.at(M, k * wide)

@@ -136,7 +136,11 @@ class OneStepKernel(Kernel):
     """
 
     def __init__(
-        self, code: OneStep, single: OneStep, more: Callable[[Any], Any] | None = None, own: np.ndarray | None = None
+        self,
+        code: OneStep,
+        single: OneStep,
+        more: Callable[[np.ndarray], np.ndarray] | None = None,
+        own: np.ndarray | None = None,
     ) -> None:
         self._code, self._single, self._more, self._own = code, single, more, own
 

@@ -8,10 +8,10 @@ own. Each pair is met once: its force is added to one body and taken from the ot
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 import sympy as sp
@@ -122,7 +122,8 @@ def with_parts(total: Any, parts: Sequence[tuple[Any, Sequence[Any]]], axis: int
 class FewSymbols:
     """A few bodies in the place of a symbolic Hamiltonian, whose parameters are all that a pair depends on."""
 
-    T, samples = None, dict[str, Any]()
+    T = None
+    samples: ClassVar[Mapping[str, Any]] = {}
 
     def __init__(self, local: PairsHamiltonian) -> None:
         named = {c.name: value for c, value in zip(local.c, local.constants, strict=True)}
@@ -132,10 +133,14 @@ class FewSymbols:
         named |= {f"w_{i}": 1 / mass for i, mass in enumerate(local.masses.tolist())}
         for i, column in enumerate(local.columns):
             named |= {f"column_{i}_{k}": x for k, x in enumerate(column.tolist())}
-        self.local, self.ndof, self.parametric = local, local.ndof, self
+        self.local, self.ndof = local, local.ndof
         self.values, self.parameters = tuple(named.values()), tuple(map(sp.Symbol, named))
         self.q, self.p = (tuple(sp.Symbol(f"{x}{i + 1}") for i in range(self.ndof)) for x in "qp")
         self.inverse_mass = sp.diag(*(sp.Symbol(f"w_{i // local.dim}") for i in range(self.ndof)))
+
+    @property
+    def parametric(self) -> FewSymbols:
+        return self
 
     @cached_property
     def V(self) -> sp.Expr:
@@ -156,13 +161,13 @@ def few(local: PairsHamiltonian) -> tuple[Callable[..., Splitting] | None, tuple
 class FewSplitting(Splitting):
     """The kicks and drifts of a few bodies."""
 
+    polynomial = False
+
     @property
     def key(self) -> tuple[Any, ...]:
         local = self.symbols.local
         pair = local.V, local.first, local.c, local.cutoff is None, local.box is None
         return *pair, local.n_bodies, local.dim, self.level, self.compensated, self.friction
-
-    polynomial = False
 
     def kinds(self) -> Sequence[Stage | WithinRange]:
         _check_level(self.level)
@@ -489,7 +494,7 @@ class PairCode(SharedRollouts):
             arrays["work"] = zeros(ARRAYS * dim * size)
             numbers = sizes | {"member": k} | {name: address(x) for name, x in arrays.items()}
             context = np.array([numbers[name] for name in FIELDS], dtype=np.int64)
-            return aligned(3 * sets * dim * size), context, arrays
+            return Member(aligned(3 * sets * dim * size), context, arrays)
 
         return member
 

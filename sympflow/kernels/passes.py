@@ -25,7 +25,11 @@ MOST_OPERATIONS = 2000  # of an H that is written out
 
 
 def all_within(system: HamiltonianSystem, domain: Box | EnergySublevel, states: np.ndarray, slack: float) -> bool:
-    """True if all states (..., 2d) are in the domain, as its `contains` tells; False may mean not compiled."""
+    """True if every one of the states (..., 2d) is in the domain, as its `contains` with this slack tells.
+
+    A sublevel without an H is one of the system's. False says nothing where a sublevel has another H, or where the
+    system cannot be compiled.
+    """
     from sympflow.hamiltonian.domain import Box
 
     symbols, width = system.symbols, states.shape[-1]

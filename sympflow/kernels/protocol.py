@@ -22,7 +22,8 @@ NOTHING: Any = np.empty(0)
 class RunCheckpoint:
     """The place where a run is cut: with it, pieces of a run give the same bits as the run in one piece.
 
-    Consecutive steps share a kick or a drift, and compensated sums have errors, so that the running state is no output.
+    The states that a run saves are not enough for that: consecutive steps share a kick or a drift, so that the running
+    state is another one, and compensated sums have errors.
     A run goes on from a carry and leaves its end there; one that is interrupted leaves it as it was. `steps` are those
     made so far, `running` (K,), or (N, K) of a batch, the kernel's own: None before a run, NaN where a trajectory has
     ended. The next running state of a batch may be written into `spare`.
@@ -105,7 +106,12 @@ class Batch(NamedTuple):
 
 
 def run_states(
-    rollout: Callable[[Batch], None], task: Task, width: int, work: float, start: Any = None, counts: bool = False
+    rollout: Callable[[Batch], None],
+    task: Task,
+    width: int,
+    work: float,
+    start: np.ndarray | None = None,
+    counts: bool = False,
 ) -> Run:
     """A run of every row of a task by `rollout(batch)`, which is compiled, on as many threads as pay.
 
@@ -191,7 +197,7 @@ class Kernel(ABC):
 
         The states after the steps of `save`, sorted int64, are kept. A `carry` says where the run goes on, and is left
         with its end: all counts are from `y0`, with which the first piece began, and `save` begins after
-        ``carry.steps``.
+        ``carry.steps``. Without `threads` there are as many as pay.
         """
         if y0.ndim > 1:
             return self.runs(Task(h, y0, n_steps, save, carry, t0, threads))

@@ -69,7 +69,7 @@ class Rollouts(ABC):
     every, block : int
         Steps after which `look` changes the running state, if given; steps between two looks for the end of a run.
     counted, closing : bool
-        True if the last of `n_values` is a count, which is no part of the running state; False if none closes outputs.
+        True if the last of `n_values` is a count, which is not part of the running state; False if none closes outputs.
     given, own : int
         Numbers of which a column is made, and how many of them, the last ones, each trajectory may have of its own.
     """

@@ -18,9 +18,19 @@ from sympflow.compiler.control import BOOL, INT, POINTER, Code, Module, Rows, Ty
 from sympflow.compiler.machine import compiled, host
 
 __all__ = [
-    "Lanes", "Memory", "Numbers", "Room", "Values", "begun", "finished", "groups", "map_function", "reverse_function",
-    "run_function", "step_function",
-]  # fmt: skip
+    "Lanes",
+    "Memory",
+    "Numbers",
+    "Room",
+    "Values",
+    "begun",
+    "finished",
+    "groups",
+    "map_function",
+    "reverse_function",
+    "run_function",
+    "step_function",
+]
 
 FAST_MEMORY = 16_384  # bytes of the states of a chunk after the other, and of their ends
 MOST_CHUNKS = 32
@@ -62,18 +72,43 @@ def run_function(
 ) -> Callable[..., None]:
     """Compile the runs of trajectories, `width` of them side by side, and of these as many as the fast memory holds.
 
-    A state has `n_values` numbers, of which the first `n_out` are the output; with `memory` their sizes are arguments.
-    Each trajectory may have its `own` table; `closing` is False if `closes` is always 0. After each `every` steps
-    ``look(values)`` changes the running state, or ``look(room)`` in place. `over` is the stage of many states in
-    memory, where it is long. With `kept` a further argument is the address of ((n_steps − first)·link + 1) states of
-    all trajectories side by side, group by group: those before each stage and the last one, for `reverse_function`.
+    Parameters
+    ----------
+    n_values, n_out : int
+        Numbers of a state, and how many of them, the first ones, are the output.
+    size : int
+        Numbers of a column.
+    stage
+    width : int
+    own : bool
+        True if each trajectory has a table of its own.
+    memory : callable, optional
+        How states are in memory: then their sizes are arguments of the function, not `n_values` and `n_out`.
+    look : callable, optional
+        ``look(values)``, the values of the running state after each `every` steps of the run, changed so that the
+        outputs are the same but for what it knows of; of states in memory ``look(room)`` in place.
+    every : int
+        Steps between two looks, for a state that is not finite too.
+    closing : bool
+        False if `closes` is always 0.
+    over : callable, optional
+        The stage of many states, where these are to be in memory: as pays where a stage is long.
+    kept : bool
+        True to keep the state before each stage, and the last one, for `reverse_function`: a further argument is the
+        address of ((n_steps − first)·link + 1) states of all trajectories side by side, group by group.
 
-    Returns a function of addresses and integers (table, kinds, link, closes, rows, n_rows, first, n_steps, save,
-    n_saved, out, finite, running, keeps, stop), then `MEMORY`. The table holds columns of `size` numbers or, of their
-    own, `size` times `width`, a table for every `width` trajectories. `rows` (n_rows, n_values) are the states after
-    `first` steps. Outputs are made after ``save[i]`` steps, later than `first`. `finite[i]` becomes the last step of
-    row i that ends in a finite state; side by side only whether it is `n_steps`, else −1. Where `keeps` is 1, `running`
-    is left with the state of the run. Ends soon if ``stop[0]`` becomes 1.
+    Returns
+    -------
+    callable
+        Of addresses and integers (table, kinds, link, closes, rows, n_rows, first, n_steps, save, n_saved, out, finite,
+        running, keeps, stop), of states in memory then `MEMORY`.
+
+        The table holds columns, in each of these `size` numbers or, for tables of their own, `size` times `width`, a
+        table for every `width` trajectories. `rows` (n_rows, n_values) are the states to begin with, those of the run
+        where it goes on after `first` steps. Outputs are made after ``save[i]`` steps, later than `first`, with the
+        closing column where `closes` is 1. `finite[i]` becomes the last step of row i that ends in a finite state; of
+        trajectories side by side only whether it is `n_steps`, else −1. Where `keeps` is 1, `running` is left with the
+        state of the run. Ends soon if ``stop[0]`` becomes 1.
     """
     types = [POINTER, POINTER, INT, INT, POINTER, INT, INT, INT, POINTER, INT, POINTER, POINTER, POINTER, INT, POINTER]
     types += [POINTER] * kept + (MEMORY if memory else [])
@@ -161,10 +196,12 @@ def reverse_function(
     """Compile the reverse of runs whose states were kept: cotangents of the outputs are pulled back to the beginning.
 
     Returns a function of addresses and integers (table, kinds, link, kept, rows, n_rows, first, n_steps, save, n_saved,
-    out, slopes, columns, starts, values), then `MEMORY`: `rows` (n_rows, n_values) are the cotangents of the running
-    states after `n_steps` steps, and become those after `first`; `out` (n_rows, n_saved, n_out) those of the outputs.
-    With `slopes`, what own tables would hold is added to that array. Columns are made of `columns` (n_given, link + 2),
-    of which the last ones follow each state in `starts`: `values` (n_rows, n_own) are the cotangents of these.
+    out, slopes, columns, starts, values): `rows` (n_rows, n_values) are the cotangents of the running states after
+    `n_steps` steps, and become those after `first`; `out` (n_rows, n_saved, n_out) those of the outputs, later than
+    `first`. With `slopes`, what a table of its own for every `width` trajectories would hold is added to that array, in
+    the same order. The numbers of columns are made of others, `columns` (n_given, link + 2), of which the last ones
+    follow each state in `starts` (n_rows, n_out + n_own): `values` (n_rows, n_own) are the cotangents of these, by
+    `of_values`. Where states were in `memory`, `MEMORY` follows, and `adjoint` is given the room too.
     """
     types = [POINTER, POINTER, INT, POINTER, POINTER, INT, INT, INT, POINTER, INT, *[POINTER] * 5]
     types += MEMORY if memory else []
@@ -232,7 +269,13 @@ def reverse_function(
 
 
 def map_function(
-    n_values: int, n_out: int, size: int, stage: AnyStage, width: int = 1, memory: Any = None, timed: bool = False
+    n_values: int,
+    n_out: int,
+    size: int,
+    stage: AnyStage,
+    width: int = 1,
+    memory: Callable[..., Memory] | None = None,
+    timed: bool = False,
 ) -> Callable[..., None]:
     """Compile a map of rows: all columns of one table. If `timed`, stages are given the steps of each lane.
 
@@ -357,7 +400,11 @@ class _History:
 
 
 class Memory:
-    """The state, its end, and the state before a block of steps, in memory."""
+    """The state, its end, and the state before a block of steps, in memory.
+
+    A subclass may order numbers in another way than rows do: see `open`, `store` and `keep`. Numbers are copied
+    `at_once`; `chunks` groups of trajectories run in turn.
+    """
 
     at_once = chunks = 1
     n_values: Any
@@ -611,7 +658,15 @@ class ColumnStage:
     """The stage of a column: all lanes have the same numbers, or each its own, in tables of a length."""
 
     def __init__(
-        self, code: Code, table: Value, kinds: Value, size: int, lanes: int, width: int, stage: Any, length: Any = None
+        self,
+        code: Code,
+        table: Value,
+        kinds: Value,
+        size: int,
+        lanes: int,
+        width: int,
+        stage: AnyStage,
+        length: Value | None = None,
     ) -> None:
         self.code, self._table, self._kinds, self._size, self._lanes = code, table, kinds, size, lanes
         self._width, self._stage, self._length = width, stage, length

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property, lru_cache, partial
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 from weakref import ref
 
 import numpy as np
@@ -36,7 +36,6 @@ def splitting_loops(system: HamiltonianSystem, names: tuple[str, ...] = ()) -> S
     return SplittingLoops(system, names)
 
 
-Array = np.ndarray
 LANES_OF_SUMS, LANES = 16.0, 2.0
 """By how much less a kick takes in a batch than `SplittingLoops.work`: of sums and products alone, and of functions."""
 
@@ -110,11 +109,12 @@ class SplittingLoops:
             given = gradient, hessian_vector, system.inverse_mass, self.driven
             ndim = None if system.damping is None else system.damping.ndim
             self._compile = partial(function_code, system.ndof, *given, ndim)
-        elif (local := cast(Any, system.local)) is not None:
+        elif system.local is not None:
+            local: Any = system.local  # of the class that `loops` names
             if system.damping is not None and system.damping.ndim:
                 raise arrays_only(f"`system` {system.name!r} has friction, and its loops take one rate for all momenta")
             if local.arrays_only:
-                raise NotCompiled(f"`system` has {local.arrays_only}, whose kicks are array operations: use 'array'.")
+                raise arrays_only(f"`system` has {local.arrays_only}, whose kicks are array operations")
             if local.loops == "pairs":
                 from sympflow.kernels.pairs import PairCode, few
 
@@ -274,9 +274,16 @@ class SplittingLoops:
         return out
 
     def _damped_rows(
-        self, functions: SplittingRollouts, table: StageTable, x: Array, h: Array, y: Array, t: Array, varied: bool
-    ) -> Array:
-        """`step_rows` with friction, whose numbers are no polynomials: by one table, or one of its own for each row."""
+        self,
+        functions: SplittingRollouts,
+        table: StageTable,
+        x: np.ndarray,
+        h: np.ndarray,
+        y: np.ndarray,
+        t: np.ndarray,
+        varied: bool,
+    ) -> np.ndarray:
+        """`step_rows` with friction, whose numbers are not polynomials: by one table, or one for each row."""
         alike = len(y) > 0 and not varied and bool((h == h[0]).all() and (t == t[0]).all())
         rows, key = slice(0, 1 if alike else len(y)), (table, x[0], h[0], t[0]) if alike else None
         known, numbers = self._damped_numbers
@@ -289,7 +296,9 @@ class SplittingLoops:
         functions.mapped(numbers, y, out)
         return out
 
-    def _damped_table(self, table: StageTable, x: Array, h: Array, y: Array, t: Array, varied: bool) -> Array:
+    def _damped_table(
+        self, table: StageTable, x: np.ndarray, h: np.ndarray, y: np.ndarray, t: np.ndarray, varied: bool
+    ) -> np.ndarray:
         """The numbers of steps with friction, of each stage those of all rows."""
         own, m = table.valued(x, h).damped(self.friction), len(table.drifts)
         values: Sequence[Any] = [*np.tile(y[:, 2 * self.ndof :].T, m)] if varied else self.values

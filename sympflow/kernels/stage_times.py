@@ -70,7 +70,7 @@ class Driving:
 
 
 def driven_form(symbols: SymbolicHamiltonian) -> Driving:
-    """The driven form of a separable H; NotCompiled if T is no sum of f(t) g(p) with elementary integrals of f."""
+    """The driven form of a separable H; NotCompiled if T is not a sum of f(t) g(p) with elementary ∫f dt."""
     t = symbols.time
     assert t is not None
     assert symbols.T is not None

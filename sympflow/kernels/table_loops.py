@@ -99,15 +99,25 @@ class TableLoops:
 class LabelErrors:
     """Weighted errors of labels after a step, and their derivatives by parameters on which its numbers depend affinely.
 
-    States x (2d, N) start, of a driven system at times t0 (N,), and go to y (R, J N), times first. `scale` (R, J N) are
-    weights of the errors of the components, `slope` (R', J N) those of one more error, their sum; `design` (J, n, f)
-    the derivatives of the numbers by the parameters. `matrices` (J, k, f) are those of k numbers to which all others
-    are in proportion.
+    States x (2d, N) start, of a driven system at times t0 (N,), and go to y (R, J N), times first: of a driven system
+    with its work, or without. `scale` (R, J N) are weights of the errors of the first components, `slope` (R', J N)
+    those of one more error, a sum over the components; `design` (J, n, f) the derivatives of the numbers, in the order
+    of the stages, by the parameters. Errors are in the order of the label times, of the components, of the states.
+    `matrices` (J, k, f) are the derivatives by the parameters, at each time, of k numbers to which all others are in
+    proportion.
     """
 
-    def __init__(self, loops: TableLoops, *labels: Any) -> None:
-        x, t0, y, scale, slope, design = labels
-        self._loops, self._count, self._given = loops, x.shape[1], labels
+    def __init__(
+        self,
+        loops: TableLoops,
+        x: np.ndarray,
+        t0: np.ndarray | None,
+        y: np.ndarray,
+        scale: np.ndarray,
+        slope: np.ndarray,
+        design: np.ndarray,
+    ) -> None:
+        self._loops, self._count, self._given = loops, x.shape[1], (x, t0, y, scale, slope, design)
         times = len(design)
         leaders, leader, factors = _in_proportion(design.swapaxes(0, 1).reshape(design.shape[1], -1))
         self.matrices = np.ascontiguousarray(design[:, leaders])
@@ -128,7 +138,12 @@ class LabelErrors:
     def __call__(
         self, c: np.ndarray, check: Callable[[], None] = lambda: None, linearized: bool = False
     ) -> tuple[np.ndarray, np.ndarray]:
-        """The errors (m,) for numbers c (J, n), and their derivatives (k, m); `check` is called now and then."""
+        """The errors (m,) for numbers c (J, n), and if `linearized` their derivatives by the k numbers, (k, m).
+
+        Those by the parameters are these, of each time, times its matrix.
+
+        `check` is called now and then, and may raise.
+        """
         loops, (times, _, n) = self._loops, self._shape
         r, J = np.empty(self._shape), np.empty((self.matrices.shape[1] if linearized else 0, *self._shape))
         maps = loops.maps
@@ -143,7 +158,10 @@ class LabelErrors:
 
 
 def _in_proportion(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rows (k,) to one of which, at a place (n,), each of all rows is in proportion by a factor (n,), 0 of zeros."""
+    """Rows (k,) such that each of all rows (n,) is a factor (n,) times the one of a place (n,) among them.
+
+    Factors of rows of zeros are 0.
+    """
     leaders: list[int] = []
     leader, factors = np.zeros(len(rows), dtype=np.int64), np.zeros(len(rows))
     for i, row in enumerate(rows):
@@ -249,9 +267,17 @@ def _product(A: Sequence[Sequence[Any]], x: Sequence[Any]) -> list[Any]:
 class _Errors:
     """The function of the errors r of labels, and of their derivatives J.
 
-    Its arguments are the addresses of a plan, with those of the arrays and the sizes that `__init__` reads; of the
-    numbers c (J, n) at each time and the motions (J, drifts, 2 d²) of drifts with friction; of r (J, errors, N), J (k,
-    J, errors, N), and memory; then the first and the last block of labels.
+    Its arguments are the addresses of
+
+    - a plan: the addresses of the kinds of stages (S,), 1 for a kick, and of the values of parameters; of the states X
+      (2D, N) at the start, of a driven system with t and a work of 0; of the labels Y and the weights of their errors
+      (R, J N), and those of one more (R', J N), a sum over components; of the derivatives of numbers by parameters that
+      are not 0 where those of each parameter begin (k + 1,), then the numbers (m,), and of their values (m,); then S,
+      the number of drifts, J, N, n, R, R', k;
+    - the numbers c (J, n) at each time, and with friction the motions (J, drifts, 2 d²) of drifts;
+    - r (J, errors, N), J (k, J, errors, N), and memory;
+
+    then the first and the last block of labels.
     """
 
     def __init__(self, maps: _Maps, linearized: bool) -> None:

@@ -10,7 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import copy_context
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -84,8 +84,12 @@ def _waited(meeting: Value, members: Value, stop: Value) -> None:
         going.value = code.apply("eq", (seen(TURN), turn)) & stopped
 
 
-Member = tuple[np.ndarray, np.ndarray, Any]
-"""A thread in its team: room for three states, what stages read, and what is kept for the addresses in that."""
+class Member(NamedTuple):
+    """The view that one thread has of its team."""
+
+    room: np.ndarray  # for three states
+    context: np.ndarray  # numbers and addresses that stages read, of int64
+    others: Any  # what is kept for these addresses
 
 
 class SharedMemory(Memory, ABC):
@@ -151,8 +155,8 @@ class SharedRollouts(SplittingRollouts):
         members = self.members(meeting, stop, threads, max(1, min(BLOCK, MOMENT // max(1, self.work))))
 
         def run(k: int) -> None:
-            room, context, _kept = members(k)
-            function(*given, len(room) // 3, self.n_out, address(room), address(context))
+            own = members(k)
+            function(*given, len(own.room) // 3, self.n_out, address(own.room), address(own.context))
 
         together(threads, run, stop)
 

@@ -230,9 +230,11 @@ def hint(
 ) -> str | None:
     """The likeliest reason why the terms do not explain the data, with the remedy; None for none.
 
-    A force and drives that the model has already are no reason; beside any force friction is none.
+    A force and drives that the model has already are not a reason; nor is friction beside any force.
     """
-    d, scales, smooth = data.ndof, data.scales, smooth.some(MOST_SLOPES)
+    d = data.ndof
+    scales = data.scales
+    smooth = smooth.some(MOST_SLOPES)
     x, v = smooth.points, smooth.slopes
     X = library.fields(x)
     if force is not None:
@@ -338,7 +340,8 @@ def drive_frequency(X: np.ndarray, smooth: Smooth, scales: np.ndarray, drive: Dr
 
     The peaks of the periodograms with each of its terms are compared by a fit of all, and the best is refined.
     """
-    d, most = X.shape[1] // 2, min(int(2 * smooth.longest / smooth.step), FREQUENCIES)
+    d = X.shape[1] // 2
+    most = min(int(2 * smooth.longest / smooth.step), FREQUENCIES)
     frequencies = np.pi / smooth.longest * np.arange(0.5, max(most, 2) / 2, 0.25)
     beside = Rest.of(X, smooth.slopes, scales)
     pushes = drive.base.gradient(np.zeros(drive.base.n), smooth.points.T[:d], False, True).by_parameters
@@ -409,7 +412,8 @@ def _masses(library: Library, x: np.ndarray, v: np.ndarray, scales: np.ndarray, 
     target = np.zeros((len(x), d))
     target[:, 0] = v[:, d]
     theta = least(A, (target / scales[d:]).ravel())
-    masses, force = np.concatenate([[1.0], theta[len(of_q) :]]), -(V @ theta[: len(of_q)])
+    masses = np.concatenate([[1.0], theta[len(of_q) :]])
+    force = -(V @ theta[: len(of_q)])
     with np.errstate(all="ignore"):
         rest = ((force / masses - v[:, d:]) / scales[d:]) ** 2
     moving = ((x[:, d:] - v[:, :d]) / scales[:d]) ** 2

@@ -60,7 +60,7 @@ STARTS = 4  # Regressions from which the search begins at most
 HIGHEST = 30  # Degree of polynomials, at most
 CORRELATED = 4  # Smoothed slopes that count as one, for their errors are correlated
 OF_A_FLOW = 5.0
-"""Factor by which the last term of a flow's Hamiltonian lowers the residual at least: a flow's errors are no noise."""
+"""Factor by which the last term of a flow's Hamiltonian lowers the residual at least: a flow's errors are not noise."""
 
 
 class Regression:
@@ -235,7 +235,8 @@ class Discovery:
     def figure(self) -> Figure:
         """The path of models: the residual over the noise against the number of terms."""
         figure = new_figure(6.4, 3.6)
-        ax, counts = figure.add_subplot(), [len(model.terms) for model in self.path]
+        ax = figure.add_subplot()
+        counts = [len(model.terms) for model in self.path]
         ax.plot(counts, [model.residual for model in self.path], "o-", color="#0072B2", label="fitted trajectories")
         held = [math.nan if model.held_out is None else model.held_out for model in self.path]
         if not np.isnan(held).any():
@@ -430,7 +431,8 @@ class _Search:
         K = len(self.library)
         if not K:
             raise ValueError("`terms` has no term that changes over the data: give others.")
-        equations, asked = data.n_values - 2 * data.ndof * n, K + len(self.superfluous)
+        equations = data.n_values - 2 * data.ndof * n
+        asked = K + len(self.superfluous)
         if equations < asked:
             raise ValueError(
                 f"`data` has {data.n_values} values, {equations} beside the initial states, and the library {asked} "
@@ -629,7 +631,8 @@ class _Search:
         significance = fit.theta**2 / np.maximum(np.diag(fit.covariance()), 1e-300)
         for weakest in np.argsort(significance)[:2]:
             rest = [k for i, k in enumerate(active) if i != weakest]
-            known, made = frozenset(rest) in self.fits, self._fit(rest, active, steps)
+            known = frozenset(rest) in self.fits
+            made = self._fit(rest, active, steps)
             promised = self._criterion(active) - self.penalty + significance[weakest]
             worse = self._criterion(rest) > promised + WORTH * self.penalty
             if known and worse and significance[weakest] < self.penalty:
@@ -723,13 +726,25 @@ class _Search:
         remark = remark_on(same) if same else self._too_loud(noise) if explains else self._remark(noise, excess)
         if self.session.cut:
             remark = f"{remark} The time budget, or Ctrl-C, ended the search: give it more.".strip()
-        found = self.library.subset(chosen).expressions, fit.theta, np.sqrt(np.diag(fit.covariance()))
-        library = self.library.expressions, self.superfluous
-        return _in_order(*found, noise, self.expected, explains, remark, models, *library, same)
+        found = Discovery(
+            terms=self.library.subset(chosen).expressions,
+            coefficients=fit.theta,
+            errors=np.sqrt(np.diag(fit.covariance())),
+            noise=noise,
+            expected_noise=self.expected,
+            explains=explains,
+            remark=remark,
+            path=models,
+            library=self.library.expressions,
+            superfluous=self.superfluous,
+            unseen=same,
+        )
+        return _in_order(found)
 
     def _unseen(self, chosen: list[int], fit: Fit) -> tuple[sp.Expr, ...]:
         """Functions that are the same along all orbits: of q alone and of p alone where H is separable."""
-        d, states = self.data.ndof, np.concatenate(fit.orbits, axis=1).T
+        d = self.data.ndof
+        states = np.concatenate(fit.orbits, axis=1).T
         errors = fit.noise() * math.sqrt(fit.states.size / fit.counts.sum())
         separable = all(self.library.terms[k].kind(d) != "y" for k in chosen)
         groups = [range(d), range(d, 2 * d)] if separable else [range(2 * d)]
@@ -792,10 +807,11 @@ class _Search:
         )
 
 
-def _in_order(terms: tuple[sp.Expr, ...], theta: Any, errors: Any, *more: Any) -> Discovery:
-    """The record with its terms in the order of their names."""
-    order = np.argsort([str(f) for f in terms])
-    return Discovery(tuple(terms[i] for i in order), np.array(theta)[order], np.array(errors)[order], *more)
+def _in_order(found: Discovery) -> Discovery:
+    """The same with its terms in the order of their names."""
+    order = np.argsort([str(f) for f in found.terms])
+    terms = tuple(found.terms[i] for i in order)
+    return replace(found, terms=terms, coefficients=found.coefficients[order], errors=found.errors[order])
 
 
 def _residual(cost: float, freedom: int) -> float:
@@ -838,12 +854,16 @@ def _of_flow(
     misfits = [regression.misfit(active) for active in path]
     chosen = max((i for i in range(1, len(path)) if misfits[i - 1] > OF_A_FLOW * misfits[i]), default=len(path) - 1)
 
-    def model(active: list[int], misfit: float) -> Model:
-        theta, errors = regression.coefficients(active).tolist(), regression.errors(active).tolist()
-        found, residual = library.subset(active).expressions, misfit / max(misfits[chosen], 1e-300)
-        return Model(found, tuple(theta), tuple(errors), residual, regression.criterion(active))
-
-    models = tuple(map(model, path, misfits))
+    models = tuple(
+        Model(
+            library.subset(active).expressions,
+            tuple(regression.coefficients(active).tolist()),
+            tuple(regression.errors(active).tolist()),
+            r / max(misfits[chosen], 1e-300),
+            regression.criterion(active),
+        )
+        for active, r in zip(path, misfits, strict=True)
+    )
     best = models[chosen]
     spread = float(np.std(values))
     explains = misfits[chosen] < 0.05 * spread
@@ -851,9 +871,19 @@ def _of_flow(
         f"No sparse sum of the library's {len(library)} terms is the flow's Hamiltonian: {misfits[chosen]:.3g} is left "
         f"of its spread {spread:.3g}. Give other `terms`, or a smaller `domain`."
     )  # fmt: skip
-    noise = np.array([misfits[chosen]]), np.zeros(1)
-    more = explains, remark, models, library.expressions, superfluous
-    discovery = _in_order(best.terms, best.coefficients, best.errors, *noise, *more)
+    record = Discovery(
+        terms=best.terms,
+        coefficients=np.array(best.coefficients),
+        errors=np.array(best.errors),
+        noise=np.array([misfits[chosen]]),
+        expected_noise=np.zeros(1),
+        explains=explains,
+        remark=remark,
+        path=models,
+        library=library.expressions,
+        superfluous=superfluous,
+    )
+    discovery = _in_order(record)
     system = _system(discovery, flow.ndof, name=name, domain=found, y0=x[0], dt=flow.dt / 10)
     if not explains:
         warn(remark)

@@ -106,7 +106,8 @@ class Constraints:
     def driven(self, frequency: float) -> Drive:
         """Forces and stiffnesses of this frequency: of degree 2 in q, of an angle its first harmonic."""
         scales, periods = self.scales[: self.ndof], self.periods[: self.ndof]
-        base, pushes = Waves.up_to(1, 2, "q", scales, periods), np.eye(self.ndof)[np.isfinite(periods)]
+        base = Waves.up_to(1, 2, "q", scales, periods)
+        pushes = np.eye(self.ndof)[np.isfinite(periods)]
         exponents = np.concatenate([base.powers.exponents, pushes])
         waves, phases = np.concatenate([base.waves, 0 * pushes]), np.concatenate([base.phases, 0 * pushes[:, 0]])
         return Drive(Waves("q", exponents, waves, phases, scales), frequency)

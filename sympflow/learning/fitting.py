@@ -270,7 +270,7 @@ class Held:
 
     @property
     def complaint(self) -> str:
-        """The reason why they are no noise."""
+        """The reason why they are not noise."""
         if not math.isfinite(self.loudness):
             return "there was no time to follow them"
         if self.excess >= LOUDER:
@@ -317,7 +317,8 @@ def judged(found: Fitted, held: Trajectories, setting: Setting) -> Held:
     some = int(pairs * (1 - near) / (1 + near)) if near > SMOOTHED else 0
     lagged = setting.lag > held.time_scale and some >= FEWEST_PAIRS and abs(far) < FORGOTTEN
     correlation, pairs = (far, some) if lagged else (near, beside)
-    losses, loudness = np.where(np.isfinite(losses), losses, np.inf), math.sqrt(fit.cost / values)
+    losses = np.where(np.isfinite(losses), losses, np.inf)
+    loudness = math.sqrt(fit.cost / values)
     excess = 0.0
     if setting.seen is not None and (setting.seen > 0).any() and not lagged:  # else it is not seen
         excess = float(np.max(found.sigma[setting.seen > 0] / setting.seen[setting.seen > 0]))

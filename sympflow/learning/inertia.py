@@ -84,7 +84,8 @@ class Inertia(Part):
         u = np.stack([np.einsum("ijn,jn->in", self._matrices(rows), v) for rows in moved])  # (∂M/∂q_k) v
         slopes = by = None
         if slope:
-            Wu, slopes = np.einsum("ijn,kjn->kin", W, u), np.empty((m, m, N))
+            Wu = np.einsum("ijn,kjn->kin", W, u)
+            slopes = np.empty((m, m, N))
             slopes[d:, d:] = W
             slopes[d:, :d] = -Wu.transpose(1, 0, 2)
             slopes[:d, d:] = -Wu
@@ -92,7 +93,9 @@ class Inertia(Part):
                 curved = -0.5 * ((C[:, used] @ rows) * products).sum(axis=0) + (u[i] * Wu[j]).sum(axis=0)
                 slopes[i, j] = slopes[j, i] = curved
         if by_parameters:
-            by, k, pair = np.empty((m, self.n, N)), self.entries[:, 0], self._pair
+            by = np.empty((m, self.n, N))
+            k = self.entries[:, 0]
+            pair = self._pair
             g = f[k] - self._shift[:, None]
             pulled = np.stack([W[:, i] * v[j] + (W[:, j] * v[i] if i != j else 0.0) for i, j in self.pairs], axis=1)
             for i in range(d):
@@ -105,7 +108,8 @@ class Inertia(Part):
         d, N = q.shape
         f, first = self.functions.functions(q), self.functions.derivatives(q)[0]
         k, pair = self.entries[:, 0], self._pair
-        g, made = f[k] - self._shift[:, None], np.zeros((2 * d, self.n, N))
+        g = f[k] - self._shift[:, None]
+        made = np.zeros((2 * d, self.n, N))
         for place, (i, j) in enumerate(self.pairs):
             own = pair == place
             made[i, own] = g[own] * v[j]

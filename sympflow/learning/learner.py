@@ -132,8 +132,8 @@ def learn(
     Warns
     -----
     UserWarning
-        If the residuals of the best model are no noise; with what a vector field that need not be Hamiltonian leaves of
-        them, and the likeliest reason.
+        If the residuals of the best model are not noise; with what a vector field that need not be Hamiltonian leaves
+        of them, and the likeliest reason.
 
     References
     ----------
@@ -162,24 +162,18 @@ def learn(
     rate = float(np.sqrt(np.mean((smooth.slopes / data.scales) ** 2))) if len(smooth.slopes) else 0.0
     seen = smooth.sigma if data.n_points >= ROUGH else None
     setting = Setting(noise_of(noise, data.ndof), huber, seen=seen, lag=LAG / rate if rate > 0 else 0.0)
-    longest = max(run.span for run in data.runs)
-    step = float(f"{min(1 / rate, longest) if rate > 0 else longest:.1g}")  # of a flow that is fitted itself
     constraints = replace(
         constraints,
         frequencies=frequencies_of(constraints, smooth) if drive is True else frequencies,
-        flow_scaling=data.scaling._replace(t=step if dt is None else float(dt)),
+        flow_scaling=data.scaling._replace(t=_step(data, rate) if dt is None else float(dt)),
     )
     chosen = families(constraints, family)
-    pieces = min(FEW, data.n_points // ALONE)  # of a trajectory that is the only one
-    whole = data if len(data.runs) > 1 or pieces < 2 else data.pieces(math.ceil(data.n_points / pieces))
-    folds = [(_cut(one, rate), _cut(others, rate)) for one, others in whole.folds(HELD_OUT, seed)]
+    folds = [(_cut(one, rate), _cut(others, rate)) for one, others in _divided(data, seed)]
     if len(folds) == 1:
         folds = [(_few(folds[0][0], seed), _few(folds[0][1], seed))]
     options: dict[str, Any] = {"family": family, "loss": loss, "seed": seed, "damping": damping, "separable": separable}
     options["drive"] = constraints.frequencies
-    formulas = [str(part.expression(part.theta, coordinates_of(part.of, data.ndof))) for part in constraints.known]
-    of_data = digest([data, constraints.inverse_mass, constraints.periods, setting.noise])
-    identity = {"config": json.dumps(options), "architecture": json.dumps(formulas), "system": of_data}
+    identity = _identity(data, constraints, setting, options)
     search = Search(_cut(data, rate), folds, constraints, setting, seed, identity=identity, whole=data)
     if resume is not None:
         search.resume(resume)
@@ -190,6 +184,21 @@ def learn(
         if replicas:
             flow.replicas = search.bootstrap(replicas, session)
         return flow
+
+
+def _step(data: Trajectories, rate: float) -> float:
+    """Δt of a flow that is fitted itself: in which states move by about their spread, but no longer than the data."""
+    longest = max(run.span for run in data.runs)
+    step = min(1 / rate, longest) if rate > 0 else longest
+    return float(f"{step:.1g}")
+
+
+def _divided(data: Trajectories, seed: int) -> list[tuple[Trajectories, Trajectories]]:
+    """Divisions of the trajectories, or of pieces of the only one."""
+    pieces = min(FEW, data.n_points // ALONE)
+    if len(data.runs) > 1 or pieces < 2:
+        return data.folds(HELD_OUT, seed)
+    return data.pieces(math.ceil(data.n_points / pieces)).folds(HELD_OUT, seed)
 
 
 def _cut(data: Trajectories, rate: float) -> Trajectories:
@@ -258,3 +267,12 @@ def _formulas(known: Any, d: int) -> tuple[Fixed, ...]:
     written = ((of, f.subs(values, simultaneous=True)) for of, f in parts)
     moving = ((of, Library([f], d)) for of, f in written if f.free_symbols & {*coordinates_of(of, d)})
     return tuple(Fixed(Terms(library, of), np.ones(1)) for of, library in moving)
+
+
+def _identity(
+    data: Trajectories, constraints: Constraints, setting: Setting, options: dict[str, Any]
+) -> dict[str, Any]:
+    """The description that a search must share with the one that it goes on with."""
+    known = [str(part.expression(part.theta, coordinates_of(part.of, data.ndof))) for part in constraints.known]
+    of_data = digest([data, constraints.inverse_mass, constraints.periods, setting.noise])
+    return {"config": json.dumps(options), "architecture": json.dumps(known), "system": of_data}

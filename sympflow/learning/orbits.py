@@ -122,7 +122,8 @@ class Gauss(Stepper):
     def step(self, model: Field, theta: Array, x: Array, X: Array | None, h: Array, t: Array) -> Any:
         A, b = self._table
         m, N = x.shape
-        s, model = self.stages, model.at((t + h * A.sum(axis=1)[:, None]).ravel())
+        s = self.stages
+        model = model.at((t + h * A.sum(axis=1)[:, None]).ravel())
         K = np.repeat(model.at(t).field(theta, x, False, False).value[:, None], s, axis=1)  # (m, s, N)
         before, near = math.inf, np.reshape(self.tolerance, (-1, 1, 1))
         for _ in range(self.iterations):
@@ -138,7 +139,8 @@ class Gauss(Stepper):
         end = x + h * np.einsum("j,mjn->mn", b, K)
         if X is None:
             return end, None
-        inner, c = x[:, None] + h * np.einsum("ij,mjn->min", A, K), X.shape[1]
+        inner = x[:, None] + h * np.einsum("ij,mjn->min", A, K)
+        c = X.shape[1]
         f = model.field(theta, inner.reshape(m, s * N), True, c > m)
         S = np.broadcast_to(f.slope, (m, m, s * N)).reshape(m, m, s, N)
         rhs = np.einsum("klin,lcn->nikc", S, X, optimize=True)
@@ -211,7 +213,8 @@ class Batch:
 
 def batches(runs: Sequence[Run], columns: int) -> list[Batch]:
     """The runs in batches, of lengths that differ by a third at most."""
-    order, m = np.argsort([run.n_points for run in runs], kind="stable"), len(runs[0].y)
+    order = np.argsort([run.n_points for run in runs], kind="stable")
+    m = len(runs[0].y)
     most = max(1, MOST_NUMBERS // (m * columns))
     made: list[Batch] = []
     start = 0
@@ -226,7 +229,8 @@ def batches(runs: Sequence[Run], columns: int) -> list[Batch]:
             run = runs[i]
             gaps[1 : run.n_points, column] = np.diff(run.t)
             y[: run.n_points, :, column] = run.y.T
-        seen, starts = np.isfinite(y), np.array([runs[i].t[0] for i in index])
+        seen = np.isfinite(y)
+        starts = np.array([runs[i].t[0] for i in index])
         made.append(Batch(index, gaps, np.where(seen, y, 0.0), seen.astype(float), starts))
         start = stop
     return made

@@ -27,7 +27,7 @@ UNITS = {  # units in those of the SI, angles in radians
 TIMES = ("t", "time")
 RUNS = (ORBIT, "run", "run_id", "trajectory", "trajectory_id", "traj", "id")
 """Names of the columns of times and of trajectories that are recognized, in lower case."""
-BESIDE = ("energy", "status")  # columns of tables of sympflow that are no states
+BESIDE = ("energy", "status")  # columns of tables of sympflow that are not states
 VELOCITY = r"v_?(\d*)|dq_?(\d*)(?:_?dt)?|q_?(\d*)_?dot_?(\d*)"
 """Names of the columns of velocities: v1, dq1, dq1_dt, q1_dot, qdot1."""
 ORDERS = ("halves", "pairs")
@@ -72,7 +72,7 @@ def _numbers(values: Any, name: str) -> np.ndarray:
             raise TypeError("complex numbers" if array.dtype.kind == "c" else "booleans")
         return array.astype(float)
     except (TypeError, ValueError) as error:
-        raise TypeError(f"`data` has {name} that are no real numbers ({error}): give arrays of numbers.") from error
+        raise TypeError(f"`data` has {name} that are not real numbers ({error}): give arrays of numbers.") from error
 
 
 def _is_array(values: Any, ndim: int) -> bool:
@@ -118,7 +118,7 @@ def _of_one(i: int, one: Any) -> Found:
     if isinstance(one, Run):
         return "", one.t, one.y
     if not (isinstance(one, Sequence) and len(one) == 2):
-        raise TypeError(f"`data[{i}]` is no trajectory: give a pair (t, y) of arrays, t (n,) and y (2d, n).")
+        raise TypeError(f"`data[{i}]` is not a trajectory: give a pair (t, y) of arrays, t (n,) and y (2d, n).")
     return "", _numbers(one[0], "times"), _numbers(one[1], "states")
 
 
@@ -345,7 +345,7 @@ def _column(columns: list[str], given: str | None, known: Sequence[str], argumen
     if given is None:
         return next((c for word in known for c in columns if c.lower() == word), None)
     if given not in columns:
-        raise ValueError(f"`{argument}` is {given!r}, which is no column: there are {', '.join(columns)}.")
+        raise ValueError(f"`{argument}` is {given!r}, which is not a column: there are {', '.join(columns)}.")
     return given
 
 
@@ -449,7 +449,9 @@ def factors_of(units: Mapping[str, str | float] | None, names: tuple[str, ...]) 
         elif name in TIMES:
             of_time = factor
         else:
-            raise ValueError(f'`units` names {name!r}, which is no coordinate: "t", "q", "p", {", ".join(names)} are.')
+            raise ValueError(
+                f'`units` names {name!r}, which is not a coordinate: "t", "q", "p", {", ".join(names)} are.'
+            )
     return factors, of_time
 
 

@@ -53,7 +53,7 @@ MARGIN = 0.05  # of the spread of the states, by which Ω exceeds them
 FREER = 0.5  # of the squares, that a field which is not Hamiltonian must leave at most to be worth a word
 CERTAIN = 5.0  # standard errors that the factor of a force is worth a word
 SYMPLECTIC = 1e-9  # defect of a field, up to which it is of an H
-GROWS = 4.0  # standard errors below 0, from which a negative friction is no chance
+GROWS = 4.0  # standard errors below 0, from which a negative friction is more than chance
 DRAG_STEPS = 20  # of a Gauss method in Δt, with a force that has a kink
 SCATTERED, ALONG = 400, 20  # states at which 𝓗 is looked at, and trajectories of these at least
 OVER_TIMES = 5  # between 0 and Δt, at which 𝓗 is averaged
@@ -211,7 +211,8 @@ class Search:
     @property
     def reason(self) -> str:
         """Why this model."""
-        held, others = self.best[2], len({record["model"] for record in self.history}) - 1
+        held = self.best[2]
+        others = len({record["model"] for record in self.history}) - 1
         because = (
             "its residuals on held-out trajectories are no more than rounding"
             if held.exact
@@ -375,7 +376,8 @@ class Search:
         """Fit the best model with fewer numbers, and take that unless what it explains less is worth them."""
         if candidate is None:
             return
-        rich, simple = self.best, self._fit(candidate, setting, session)
+        rich = self.best
+        simple = self._fit(candidate, setting, session)
         fewer = rich[0].model.n - candidate.model.n
         lost = 2 * (simple[1].loss(rich[1].sigma) - rich[1].loss(rich[1].sigma))
         if self.late():
@@ -398,7 +400,7 @@ class Search:
         self.done = checkpoints.read_same(path, self.identity)["optimizer"]
 
     def diagnose(self, session: Session) -> None:
-        """Warn where the residuals of the best model are no noise, with what may be the reason."""
+        """Warn where the residuals of the best model are not noise, with what may be the reason."""
         candidate, _, held = self.best
         if held.explained:
             share = float(np.min(self.best[1].sigma / self.data.scales))
@@ -418,7 +420,7 @@ class Search:
             )
             return
         said = (
-            f"The best model, {candidate.name}, leaves residuals on held-out trajectories that are no noise: "
+            f"The best model, {candidate.name}, leaves residuals on held-out trajectories that are not noise: "
             f"{held.complaint}."
         )
         deadline = session.deadline
@@ -718,5 +720,6 @@ class Search:
         """𝓗 of the flow at states (n, 2d), averaged over [0, Δt]; with friction H."""
         if flow.system is not None and flow.system.friction:  # the maps of a damped flow have no 𝓗
             return flow.system.hamiltonian(states)
-        x, times = torch.as_tensor(states), flow.dt * np.arange(OVER_TIMES) / (OVER_TIMES - 1)
+        x = torch.as_tensor(states)
+        times = flow.dt * np.arange(OVER_TIMES) / (OVER_TIMES - 1)
         return np.mean([flow.hamiltonian(float(t), x).numpy() for t in times], axis=0)

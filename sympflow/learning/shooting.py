@@ -66,7 +66,8 @@ class Normal:
         theta = np.zeros(n)
         if n:
             flat = self.B.reshape(N * m, n)
-            S, D = self.C - flat.T @ Q.reshape(N * m, n), np.sqrt(np.where(scale > 0, scale, 1.0))
+            S = self.C - flat.T @ Q.reshape(N * m, n)
+            D = np.sqrt(np.where(scale > 0, scale, 1.0))
             try:
                 factor = cho_factor(S / np.outer(D, D) + damping * np.eye(n), check_finite=False)
             except np.linalg.LinAlgError:
@@ -80,7 +81,8 @@ class Normal:
     def reduced(self) -> tuple[np.ndarray, np.ndarray]:
         """JᵀJ (n, n) and −Jᵀr (n,) of θ when the initial states are eliminated."""
         n = self.C.shape[0]
-        flat, inverse = self.B.reshape(-1, n), np.linalg.pinv(self.A, hermitian=True)
+        flat = self.B.reshape(-1, n)
+        inverse = np.linalg.pinv(self.A, hermitian=True)
         x = (inverse @ self.a[..., None])[..., 0]
         return self.C - flat.T @ (inverse @ self.B).reshape(-1, n), self.c - flat.T @ x.reshape(-1)
 
@@ -200,7 +202,9 @@ class Problem:
                     return made
                 for i in range(m):
                     J = by[i] * (np.sqrt(weight[i]) / self.sigma[i])
-                    rest, by_state, by_theta = np.sqrt(weight[i]) * r[i], J[:m], J[m:]
+                    rest = np.sqrt(weight[i]) * r[i]
+                    by_state = J[:m]
+                    by_theta = J[m:]
                     a += by_state * rest
                     for j in range(m):
                         A[j] += by_state[j] * by_state

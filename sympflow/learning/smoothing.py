@@ -90,7 +90,9 @@ def _curve(run: Run) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np
             if has.any():
                 states[i] = np.interp(run.t, run.t[has], y[has])
         whole = seen.all(0)
-        t, y, none = run.t[whole], run.y[:, whole], np.full(run.y.shape, np.nan)
+        t = run.t[whole]
+        y = run.y[:, whole]
+        none = np.full(run.y.shape, np.nan)
         return states, none, (y[:, 1:] + y[:, :-1]) / 2, np.diff(y) / np.diff(t), (t[1:] + t[:-1]) / 2
     best = np.full(len(run.y), np.inf)
     states, slopes = np.zeros(run.y.shape), np.zeros(run.y.shape)
@@ -116,7 +118,8 @@ def _windows(t: np.ndarray, y: np.ndarray, seen: np.ndarray, width: int) -> tupl
     G = np.swapaxes(V * has[..., None], -1, -2) @ V + 1e-10 * np.eye(DEGREE + 1)
     right = np.moveaxis(np.swapaxes(V, 1, 2) @ np.moveaxis(known, 0, -1), -1, 0)
     inverse = np.linalg.inv(G)
-    c, share = (inverse @ right[..., None])[..., 0], np.minimum(inverse[:, :, 0, 0], 1 - 1e-6)
+    c = (inverse @ right[..., None])[..., 0]
+    share = np.minimum(inverse[:, :, 0, 0], 1 - 1e-6)
     left_out = np.where(seen, (c[..., 0] - np.where(seen, y, 0.0)) / (1 - share), 0.0)
     return c[..., 0], c[..., 1] / half, (left_out**2).sum(1)
 

@@ -149,7 +149,9 @@ class Trajectories(Shown):
             found, names = reading.of_table(data, ndof, order, time, run, q, p, velocity_mass is not None, observed)
             order = "halves"
         elif _is_a("xarray", "Dataset", data):
-            found, names, order = reading.of_dataset(data), (), "halves"
+            found = reading.of_dataset(data)
+            names = ()
+            order = "halves"
         elif isinstance(data, str | Path):
             return cls.read(reading.opened(Path(data)), ndof, **given, **converted)
         elif (
@@ -278,7 +280,7 @@ class Trajectories(Shown):
                     raise ValueError(
                         f"`trajectories` have {int(jumps.sum())} jumps of {name} by about {text}, the first in "
                         f"trajectory {at}, as of an angle that was wrapped: pass period={text}, by which it is "
-                        f"continued; or period=np.inf if {name} is no angle."
+                        f"continued; or period=np.inf if {name} is not an angle."
                     )
 
     def check_moving(self) -> None:
@@ -293,8 +295,8 @@ class Trajectories(Shown):
                 )
             if seen.size and not 1 / LARGEST < np.abs(seen).max() < LARGEST:
                 raise ValueError(
-                    f"`trajectories` have {name} up to {np.abs(seen).max():.1g}, whose powers are no numbers of this "
-                    "machine: give `units`, or numbers nearer to 1."
+                    f"`trajectories` have {name} up to {np.abs(seen).max():.1g}, whose powers overflow or vanish: "
+                    "give `units`, or numbers nearer to 1."
                 )
             if seen.size and abs(seen.mean()) > FAR * seen.std() > 0:
                 warn(

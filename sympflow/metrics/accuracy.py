@@ -94,7 +94,8 @@ def _same_field(sol: Solution, system: HamiltonianSystem) -> bool:
     y = to_numpy(sol.y).astype(float)
     states = np.moveaxis(y, -2, -1).reshape(-1, y.shape[-2])
     every = max(1, len(states) // SAMPLED)
-    t, states = np.broadcast_to(sol.t, (*y.shape[:-2], len(sol.t))).reshape(-1)[::every], states[::every]
+    t = np.broadcast_to(sol.t, (*y.shape[:-2], len(sol.t))).reshape(-1)[::every]
+    states = states[::every]
     with np.errstate(all="ignore"):
         mine, other = (to_numpy(s.vector_field(states, t)) for s in (system, sol.system))
     scale = weights(system)

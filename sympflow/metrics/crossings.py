@@ -67,7 +67,8 @@ def stroboscopic(
     other maps at other steps, and methods that choose theirs are asked for them as outputs.
     """
     t0, t1 = t_span
-    n, turn = whole_periods(t_span, period), float(np.copysign(period, t1 - t0))
+    n = whole_periods(t_span, period)
+    turn = float(np.copysign(period, t1 - t0))
     y0 = rows[0] if len(rows) == 1 else rows
     if isinstance(integrator, FixedStep) and integrator.on_grid and not integrator.trained:
         integrator = replace(integrator, dt=dividing_step(period, integrator.step_length(system)))

@@ -67,7 +67,7 @@ def largest(series: np.ndarray, sol: Solution) -> np.ndarray:
 
 
 def failed(sol: Solution) -> np.ndarray:
-    """Tell which trajectories did not reach their end, (...); stopping at the edge of the domain is no failure."""
+    """Tell which trajectories did not reach their end, (...); stopping at the edge of the domain is not a failure."""
     stopped_on_request = "domain_exit" in sol.stats and bool(np.isfinite(to_numpy(sol.y)).all())
     return (np.asarray(sol.status) < 0) & (not stopped_on_request)
 

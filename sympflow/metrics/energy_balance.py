@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -11,6 +11,9 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.lazy import kept
 from sympflow.solution import Solution, check_solution, gathered
 from sympflow.solver import solve
+
+if TYPE_CHECKING:
+    import sympy
 
 __all__ = ["energy_balance_error"]
 
@@ -43,8 +46,8 @@ def energy_balance_error(sol: Solution, relative: bool = False) -> np.ndarray:
     TypeError
         If `sol` is not a Solution.
     ValueError
-        For a system with friction, whose losses are no part of the balance; for one of which H jumps in t, where it has
-        no ∂H/∂t.
+        For a system with friction, whose losses are not part of the balance; for one whose H jumps in t, where there
+        is no ∂H/∂t.
 
     References
     ----------
@@ -108,18 +111,29 @@ def extended_system(system: HamiltonianSystem) -> HamiltonianSystem | None:
     symbols = system.symbols
     if symbols is None or symbols.samples or system.kinetic_timed:
         return None
-    d, time = system.ndof, cast(Any, symbols.time)
-    s = type(time)(f"q{d + 1}", real=True)  # SymPy's symbol
+    d, time = system.ndof, symbols.time
+    s = _symbol(f"q{d + 1}", time)
     H, values = symbols.written
-    params = {symbol.name: system.params[symbol.name] for symbol in values}
-    scene: dict[str, Any] = {"y0": np.zeros(2 * d + 2), "t_span": system.t_span, "dt": system.dt}
-    scene["name"] = f"{system.name} with the work of the drive"
-    return HamiltonianSystem.from_sympy(H.xreplace({time: time + s}), params=params, time=time, **scene)
+    return HamiltonianSystem.from_sympy(
+        H.xreplace({time: time + s}),
+        params={symbol.name: system.params[symbol.name] for symbol in values},
+        time=time,
+        name=f"{system.name} with the work of the drive",
+        y0=np.zeros(2 * d + 2),
+        t_span=system.t_span,
+        dt=system.dt,
+    )
+
+
+def _symbol(name: str, like: sympy.Symbol) -> sympy.Symbol:
+    return type(like)(name, real=True)
 
 
 def _quadrature(sol: Solution) -> np.ndarray:
     """∫ ∂H/∂t dt along the executed steps, at the outputs."""
-    system, integrator, batch = sol.system, sol.integrator, to_numpy(sol.y0).shape[:-1]
+    system = sol.system
+    integrator = sol.integrator
+    batch = to_numpy(sol.y0).shape[:-1]
     direction = 1 if sol.t_span[1] >= sol.t_span[0] else -1
     work, total, done = np.zeros((len(sol.t), *batch)), np.zeros(batch), 0
     for times, states, lengths in integrator.steps(system, sol.t_span, sol.y0):

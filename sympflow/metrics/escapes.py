@@ -178,7 +178,8 @@ def _escapes(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     system, (t0, t1) = orbits.system, orbits.t_span
     time, state = np.full(len(rows), np.inf), np.full(rows.shape, np.nan)
-    status, began = np.zeros(len(rows), dtype=np.int64), ~_inside(region, rows)
+    status = np.zeros(len(rows), dtype=np.int64)
+    began = ~_inside(region, rows)
     time[began], state[began], status[began] = t0, rows[began], 1
     where = np.flatnonzero(~began)
     y = rows[where]

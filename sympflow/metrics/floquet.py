@@ -51,7 +51,7 @@ class FloquetMultipliers:
         |y(t0 + T) − y0|: 0 of an orbit that is periodic.
     pairing : float
         ‖MᵀJM − e^{−γT}J‖₂/‖M‖₂², in comparable units of q and p; 0 where the multipliers are in pairs λ, e^{−γT}/λ. NaN
-        where friction is no single rate, or there is a force that is none of H.
+        where friction is not a single rate, or a force does not come from H.
     """
 
     multipliers: np.ndarray
@@ -145,7 +145,8 @@ def floquet_multipliers(
         )
     t_span = (float(t0), float(t0 + T))
     end = solve(system, integrator, t_span, start, t_eval=[t_span[1]]).raise_for_status().y[:, -1]
-    mismatch, scale = float(np.linalg.norm(to_numpy(end) - start)), weights(system)
+    mismatch = float(np.linalg.norm(to_numpy(end) - start))
+    scale = weights(system)
     sizes = [float(np.abs(scale * y).max()) for y in (start, system.y0) if y is not None]
     if not np.linalg.norm(scale * (to_numpy(end) - start)) <= CLOSED * (max(sizes) or 1.0):
         warn(

@@ -143,7 +143,8 @@ def frequencies(
     rows, parts, status, message = orbits.rows, [], [], ""
     most = max(1, MOST_VALUES // (len(times) * (2 * system.ndof + 4 * n)))
     for start in range(0, len(rows), most):
-        span, some = (orbits.t_span[0], float(times[-1])), rows[start : start + most]
+        span = (orbits.t_span[0], float(times[-1]))
+        some = rows[start : start + most]
         run: dict[str, Any] = {"t_eval": times, "backend": backend, "on_domain_exit": "ignore"}
         sol = solve(orbits.system, orbits.integrator, span, some, **run)
         if signal is None and (growing := _growing(sol.y[:, : system.ndof], times)):
@@ -158,7 +159,8 @@ def frequencies(
         if not message or (np.asarray(sol.status) < 0).any():
             message = sol.message
     omega, amplitude = (np.concatenate(found) for found in zip(*parts, strict=True))
-    shape, ended = (*orbits.batch, *omega.shape[1:]), np.concatenate(status).reshape(orbits.batch)[()]
+    shape = (*orbits.batch, *omega.shape[1:])
+    ended = np.concatenate(status).reshape(orbits.batch)[()]
     return Frequencies(omega.reshape(shape), amplitude.reshape(shape), ended, message)
 
 
@@ -224,13 +226,17 @@ def lines(z: np.ndarray, times: np.ndarray, n: int) -> tuple[np.ndarray, np.ndar
 
 def _lines_of(z: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
     """Angles per sample and amplitudes, in the middle, of the lines of one signal (m,)."""
-    m, angles, amplitudes = len(z), np.full(n, np.nan), np.full(n, np.nan + 0j)
+    m = len(z)
+    angles = np.full(n, np.nan)
+    amplitudes = np.full(n, np.nan + 0j)
     if not np.isfinite(z).all():
         return angles, amplitudes
     s = np.arange(m) - (m - 1) / 2
     window = 1 + np.cos(2 * np.pi * s / (m - 1))
     window /= window.sum()
-    basis, rest, strength = np.empty((0, m), dtype=complex), z, float(np.abs(z).max())
+    basis = np.empty((0, m), dtype=complex)
+    rest = z
+    strength = float(np.abs(z).max())
     for k in range(n):
         angle = _refined(rest, window, s, _start(rest, window))
         basis = np.concatenate([basis, np.exp(1j * angle * s)[None]])

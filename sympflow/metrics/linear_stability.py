@@ -36,7 +36,7 @@ from sympflow.schemes import POLYNOMIAL, Scheme
 
 DIGITS = 100  # of the arithmetic in which roots are found
 ROUNDING = 2.0**-52  # of a coefficient of a table
-STEPS_TRIED = 2048  # at which a method that is no table is differentiated
+STEPS_TRIED = 2048  # at which a method without a table is differentiated
 WIDEST = 20.0  # z up to which it is
 GROWS = 1e-5  # beyond 1, of a spectral radius that is not rounding: that of a double eigenvalue is √ε
 TURNS = 1e-5  # imaginary part of an eigenvalue that is simple, whose rounding is ε
@@ -174,7 +174,8 @@ def _windows(p: Polynomial, points: list[Decimal], values: list[Decimal]) -> tup
             if start is None and (u - level) * level <= 0 < (v - level) * level:  # leaves through this level
                 start, peak = _crossing(p, level, a, b), abs(v)
             elif start is not None and (v - level) * level <= 0 < (u - level) * level:  # comes back
-                stop, growth = _crossing(p, level, a, b) if v != level else b, peak + (peak * peak - 1).sqrt()
+                stop = _crossing(p, level, a, b) if v != level else b
+                growth = peak + (peak * peak - 1).sqrt()
                 windows.append(Window(math.sqrt(start), math.sqrt(stop), float(growth)))
                 start = None
         if start is not None:
@@ -243,7 +244,8 @@ def _positive_roots(p: Polynomial) -> list[Decimal]:
 
 def _crossing(p: Polynomial, level: Decimal, a: Decimal, b: Decimal) -> Decimal:
     """The x between a and b where p, monotone there, passes a level, to half of the digits."""
-    rising, slope = series.polyval(b, p) > series.polyval(a, p), series.polyder(p)
+    rising = series.polyval(b, p) > series.polyval(a, p)
+    slope = series.polyder(p)
     x = (a + b) / 2
     while b - a > b * Decimal(10) ** (-DIGITS // 2):
         off, steep = series.polyval(x, p) - level, series.polyval(x, slope)

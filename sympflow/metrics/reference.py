@@ -89,7 +89,8 @@ def _kahan_li(
         y = to_numpy(sol.y) if sol.y.shape[-1] == len(t) else None
         if y is not None and previous is not None:
             size = distance(system, np.where(np.isfinite(y), y, 0.0), axis=-2).max(initial=0.0)
-            before, apart = apart, _distance(system, y - previous) / (float(size) or 1.0)
+            before = apart
+            apart = _distance(system, y - previous) / (float(size) or 1.0)
             if best is not None and not apart < before:
                 apart = before
                 break

@@ -125,7 +125,7 @@ def symplecticity_defect(
     Raises
     ------
     TypeError
-        If `sol` is not a Solution, or `scale` is no number or array of numbers.
+        If `sol` is not a Solution, or `scale` is not a number or an array of numbers.
     ValueError
         If `scale` is not positive and finite, or has another shape.
     """
@@ -229,7 +229,7 @@ def conformal_defect(sol: Solution, relative: bool = False, scale: ArrayLike | N
     Raises
     ------
     TypeError
-        If `sol` is not a Solution, or `scale` is no number or array of numbers.
+        If `sol` is not a Solution, or `scale` is not a number or an array of numbers.
     ValueError
         If momenta have different rates of friction, so that the flow is not conformally symplectic; if `scale` is not
         positive and finite, or has another shape.

@@ -176,7 +176,8 @@ class Store:
             found = json.loads(_read(place / METADATA, MOST_METADATA))["metadata"]
             names = [key.removesuffix(f"/{ARRAY}") for key in found if key.endswith(f"/{ARRAY}")]
             fields = {name: Field.read(found[f"{name}/{ARRAY}"], found[f"{name}/{ATTRIBUTES}"]) for name in names}
-            attributes, strange = dict(found[ATTRIBUTES]), [name for name in names if not is_name(name)]
+            attributes = dict(found[ATTRIBUTES])
+            strange = [name for name in names if not is_name(name)]
             if strange or not STATE.fullmatch(attributes.get(KEPT, ".state-1.npz")):
                 raise ValueError(f"a path in place of a name, {(strange or [attributes.get(KEPT)])[0]!r}")
             with os.scandir(place) as entries:
@@ -300,7 +301,8 @@ class Store:
         for name, known in fields.items():
             shape = tuple(lengths.get(dim, n) for dim, n in zip(known.dims, known.shape, strict=True))
             fields[name] = replace(known, shape=shape)
-        changed, before = self.attributes | dict(attributes or {}), self.attributes.get(KEPT)
+        changed = self.attributes | dict(attributes or {})
+        before = self.attributes.get(KEPT)
         with _told(self.path):
             if state is not None:
                 last = STATE.fullmatch(before or "")

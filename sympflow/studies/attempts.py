@@ -154,7 +154,7 @@ class Row:
         Median and interquartile range of the repeats, of all trajectories together, in seconds.
     compile_time : float
         Seconds by which the first run of the method, over a few steps, took longer than a second one: compiling its
-        loops, or loading them from the cache, and imports. They are no part of the run time.
+        loops, or loading them from the cache, and imports. They are not part of the run time.
     repeats : int
         Runs that were timed, where their number depends on the row.
     force_evaluations, hessian_evaluations : int or float
@@ -267,7 +267,8 @@ def counted(x: float | None) -> str:
 
 def columns(rows: Sequence[Any], titles: Sequence[str], own: Mapping[str, Any] | None = None) -> list[Column]:
     """Columns of these titles, with cells of `CELLS` or of their own."""
-    cells, left = CELLS | dict(own or {}), ("method", "backend", "status")
+    cells = CELLS | dict(own or {})
+    left = ("method", "backend", "status")
     return [Column(title, [cells[title](row) for row in rows], title in left) for title in titles]
 
 

@@ -450,7 +450,8 @@ def combined_table(comparisons: Sequence[Comparison], width: int | None = None) 
 
     Where `width` characters do not hold it, there is a table for each system with the methods as columns.
     """
-    rows, several = [row for c in comparisons for row in c.rows], len(comparisons) > 1
+    rows = [row for c in comparisons for row in c.rows]
+    several = len(comparisons) > 1
     names = [c.title for c in comparisons for _ in c.rows]
     first = [i == 0 for c in comparisons for i in range(len(c.rows))]
     systems = [n if f and several else "" for n, f in zip(names, first, strict=True)]
@@ -479,7 +480,7 @@ def _upright(columns: Sequence[Column]) -> str:
 def _columns(rows: Sequence[Row]) -> list[Column]:
     titles = [title for title in CELLS if title not in ("batch", "rtol", "±", "steps", "leaves domain at t")]
     own: dict[str, Callable[[Row], str]] = {
-        "step": lambda row: CELLS["step"](row) or f"rtol {CELLS['rtol'](row)}".removesuffix("rtol "),
+        "step": lambda row: CELLS["step"](row) if row.tolerance is None else f"rtol {CELLS['rtol'](row)}",
         "run time": lambda row: (
             f"{seconds(row.run_time)} ± {100 * row.run_time_spread / row.run_time:2.0f} %"
             if row.run_time and row.run_time_spread is not None

@@ -285,7 +285,8 @@ def portrait(comparison: Compared) -> Figure:
     One degree of freedom: the orbit in the (q, p) plane. Two: the Poincaré section q₁ = 0 with q₁ increasing along the
     run, on each method's own map. More: q₁ against q₂. Of a driven system the states after each period, q₁ against p₁.
     """
-    system, runs = comparison.system, [run for run in comparison.runs if run.sol is not None]
+    system = comparison.system
+    runs = [run for run in comparison.runs if run.sol is not None]
     rows = -(-len(runs) // 5)
     columns = -(-len(runs) // rows)
     figure = new_figure(0.5 + 2.5 * columns, 0.5 + 2.7 * rows)
@@ -318,7 +319,8 @@ def portrait(comparison: Compared) -> Figure:
 def _phase_points(comparison: Compared, integrator: Any) -> np.ndarray:
     """The points of one run that a portrait shows, (m, 2)."""
     system = comparison.system
-    starts, period = to_numpy(comparison.y0).reshape(-1, 2 * system.ndof), _period(comparison)
+    starts = to_numpy(comparison.y0).reshape(-1, 2 * system.ndof)
+    period = _period(comparison)
     if period is not None:
         return stroboscopic(integrator, system, comparison.t_span, starts, period).states[:, [0, system.ndof]]
     if system.ndof == 2:
@@ -380,7 +382,8 @@ def _precision_curve(ax: Axes, points: Sequence[Row], cost: str, measure: str, s
     colour, marker = style
     known = []
     for p in points:
-        error, counted = getattr(p, measure), (p.force_evaluations or 0.0) + (p.hessian_evaluations or 0.0)
+        error = getattr(p, measure)
+        counted = (p.force_evaluations or 0.0) + (p.hessian_evaluations or 0.0)
         spent = p.run_time if cost == "run_time" else counted
         if error and spent and error < LEAST_PRECISE:
             known.append((error, spent, p.status == "uncertain"))

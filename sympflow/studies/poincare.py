@@ -221,12 +221,22 @@ def _checked_period(system: HamiltonianSystem, period: float | None, plane: list
 
 def _section(orbits: Orbits, seen: Crossings, where: Plane | float) -> PoincareSection:
     """The result, by the plane or by the period."""
-    plane: Any = (None, None, None)
-    if isinstance(where, Plane):
-        plane = (where.coordinate, where.level, where.direction)
-    status, period = seen.status if orbits.batch else int(seen.status[0]), where if isinstance(where, float) else None
-    found: Any = (seen.trajectory, seen.t, seen.states, status, seen.message, period)
-    return PoincareSection(orbits.system, orbits.integrator, orbits.t_span, orbits.rows, *plane, *found)
+    plane = where if isinstance(where, Plane) else None
+    return PoincareSection(
+        orbits.system,
+        orbits.integrator,
+        orbits.t_span,
+        orbits.rows,
+        None if plane is None else plane.coordinate,
+        None if plane is None else plane.level,
+        None if plane is None else plane.direction,
+        seen.trajectory,
+        seen.t,
+        seen.states,
+        seen.status if orbits.batch else int(seen.status[0]),
+        seen.message,
+        where if isinstance(where, float) else None,
+    )
 
 
 @dataclass(frozen=True, repr=False)

@@ -204,21 +204,16 @@ def _measure(
     """All points for one set of initial states."""
     scene = f"{conditions.system.name}, {conditions.trajectories} trajectories"
     say(f"{scene}: reference")
-    truth, problem = None, ""
-    try:
-        truth = compute_reference(conditions.system, conditions.t_span, conditions.y0, conditions.t)
-    except (ValueError, RuntimeError) as why:
-        problem = str(why)
+    truth, problem = _reference(conditions)
     resolved = MARGIN * (0.0 if truth is None or truth.accuracy is None else truth.accuracy)
     floor = FLOOR if conditions.measure in _KEPT else max(FLOOR, resolved)
     points: list[Attempt] = []
     for candidate, integrators in swept:
         say(f"{scene}: {candidate.label}")
         error = math.inf
-        last = Attempt(replace(candidate, integrator=integrators[-1]), Row("", "", ""))
-        last.warm_up(conditions.run, conditions.t, conditions.t_span[0], conditions.system.dt)
+        compile_time = _compiled(replace(candidate, integrator=integrators[-1]), conditions)
         for integrator in integrators:
-            point = _first(replace(candidate, integrator=integrator), conditions, last.row.compile_time)
+            point = _first(replace(candidate, integrator=integrator), conditions, compile_time)
             points.append(point)
             if truth is None:
                 point.note(f"No error: {problem}")
@@ -230,24 +225,43 @@ def _measure(
                 break
     say(f"{scene}: timing")
     again = [p for p in points if p.row.status == "ok" and (p.row.run_time or 0.0) * repeats <= budget]
-    timed = interleaved([partial(conditions.run, p.candidate.integrator) for p in again], repeats)
-    for point, run_time in zip(again, timed, strict=True):
+    times = interleaved([partial(conditions.run, p.candidate.integrator) for p in again], repeats)
+    for point, run_time in zip(again, times, strict=True):
         point.fill(run_time=run_time.median, run_time_spread=run_time.spread, repeats=repeats)
     for point in points:
         if point.sol is not None and (few := point.sol.y0.size // point.sol.y0.shape[-1]) < conditions.trajectories:
-            times = {name: getattr(point.row, name) for name in ("run_time", "run_time_spread")}
-            share = conditions.trajectories / few
-            point.fill(**{name: None if x is None else x * share for name, x in times.items()})
-            point.note(f"Timed on {few} trajectories, which the method takes one by one.")
+            _scale(point, few, conditions.trajectories)
         if point.row.status == "ok" and truth is not None and not (point.row.error or 0.0) >= resolved:
             point.fill(status="uncertain")
     return [point.row for point in points], truth
 
 
+def _reference(conditions: Conditions) -> tuple[Reference | None, str]:
+    """The reference; None and the reason where there is none."""
+    try:
+        return compute_reference(conditions.system, conditions.t_span, conditions.y0, conditions.t), ""
+    except (ValueError, RuntimeError) as problem:
+        return None, str(problem)
+
+
+def _compiled(candidate: Candidate, conditions: Conditions) -> float | None:
+    """Compile all that the points of a method run; the seconds that it took, None if it does not run."""
+    point = Attempt(candidate, Row(conditions.system.name, candidate.method, candidate.label))
+    point.warm_up(conditions.run, conditions.t, conditions.t_span[0], conditions.system.dt)
+    return point.row.compile_time
+
+
+def _scale(point: Attempt, few: int, all_of_them: int) -> None:
+    """Scale the run time of a few trajectories to all of them."""
+    times = {"run_time": point.row.run_time, "run_time_spread": point.row.run_time_spread}
+    point.fill(**{name: None if x is None else x * (all_of_them / few) for name, x in times.items()})
+    point.note(f"Timed on {few} trajectories, which the method takes one by one.")
+
+
 def _first(candidate: Candidate, conditions: Conditions, compile_time: float | None) -> Attempt:
     """The first run of a point."""
-    more: dict[str, Any] = {"trajectories": conditions.trajectories, "compile_time": compile_time}
-    point = Attempt(candidate, Row(conditions.system.name, candidate.method, candidate.label, **more))
+    row = Row(conditions.system.name, candidate.method, candidate.label, trajectories=conditions.trajectories)
+    point = Attempt(candidate, replace(row, compile_time=compile_time))
     point.run(conditions.run)
     if (sol := point.sol) is None:
         return point

@@ -183,7 +183,8 @@ def initial_states(system: HamiltonianSystem, y0: ArrayLike | None) -> np.ndarra
     if given.ndim == 2:
         return given
     system = started(system, given)
-    times, atol = system.dt * np.array(PHASES), 1e-13 * smallest_size(system, given)
+    times = system.dt * np.array(PHASES)
+    atol = 1e-13 * smallest_size(system, given)
     sol = solve(system, "dop853", (0.0, float(times[-1])), given, t_eval=times, rtol=1e-11, atol=atol)
     return sol.states if sol.success and np.isfinite(sol.y).all() else given[None]
 

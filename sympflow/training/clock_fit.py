@@ -1,4 +1,9 @@
-"""The training of a flow's clock: the times that the exact solution takes to where a scheme comes, by least squares."""
+"""The training of a flow's clock: the times that the exact solution takes to where a scheme comes, by least squares.
+
+A splitting scheme on a logarithmic Hamiltonian comes in a step s from x to a state near the orbit through x, and holds
+a time for it. The label is the time at which the exact solution in the physical time is nearest to that state; the
+clock is linear in its numbers.
+"""
 
 from __future__ import annotations
 

@@ -1,7 +1,12 @@
 """Flows of lattices: fitted on a ring of a few sites, written out by its coordinates, judged on many.
 
-One step on a few sites tells little of what a large lattice does to its energy in a thousand. So the best few tables at
-Δt that labels find are fitted further, to the errors of H in runs from many states of a larger ring.
+The numbers of a primed flow depend on the potential and Δt, not on the size. So they are fitted at states of the energy
+density of the large lattice. Held-out states and the certificate are those of the large one, with its own ends.
+
+One step on a few sites tells little of what a large lattice does to its energy in a thousand. The modified energy that
+a flow keeps differs from H by terms that hardly change in a step, such as the actions of waves whose frequencies are a
+bit wrong; these change as waves exchange energy, and a few sites have few wave lengths. So the best few tables at Δt
+that labels find are fitted further, to the errors of H in runs from many states of a larger ring.
 """
 
 from __future__ import annotations
@@ -21,10 +26,10 @@ from sympflow.hamiltonian.lattice import BOUNDARIES
 from sympflow.hamiltonian.lattice_states import DRAWN, LatticeStates
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.training.fits import PrimedFit
-from sympflow.training.least_squares import Check, Problem
+from sympflow.training.least_squares import Check
 from sympflow.training.points import Labels, Stream, shares_missed, states, step_errors
 from sympflow.training.starts import frequency
-from sympflow.training.table_fit import Table
+from sympflow.training.table_fit import RunsFit, Table
 
 MOST_FITTED = 16
 """Degrees of freedom up to which a lattice is fitted as it is, and not by a subsystem."""
@@ -61,7 +66,8 @@ class LatticeSubsystem:
         """The subsystem of a lattice, for states of a domain of it."""
         found = domain if isinstance(domain, LatticeStates) else LatticeStates.of_states(lattice, domain.sample(DRAWN))
         small = lattice.ndof <= MOST_FITTED
-        few: Any = lattice if small else lattice.subsystem()
+        few = lattice if small else lattice.subsystem()
+        assert few.local is not None
         H, written = few.local.written_out(), few
         if H is not None:
             scene: Any = {"damping": lattice.damping, "t_span": lattice.t_span, "dt": lattice.dt}
@@ -86,11 +92,13 @@ class LatticeSubsystem:
         flow.recipe = {name: value for name, value in fitted.recipe.items() if name != "scaling"}
         flow.recipe["fitted_on"] = self.few.ndof
         flow.figures, flow.history = dict(fitted.figures), fitted.history
-        local: Any = self.lattice.local
+        local = self.lattice.local
+        assert local is not None
         if self.lattice.damping is None and local.uniform and local.ends:
             flow.figures |= {f"ends_{end}": self._error_at(flow, end) for end in BOUNDARIES}
         smaller = local.judged()  # with the same ends
-        judged: Any = self.lattice.subsystem(*smaller) if smaller else self.lattice
+        judged = self.lattice.subsystem(*smaller) if smaller else self.lattice
+        assert judged.local is not None
         own = flow.bound(judged) if smaller else flow
         domain = self.states.of(judged)
         width = judged.local.numbers
@@ -114,7 +122,8 @@ class LatticeSubsystem:
 
     def _error_at(self, flow: PrimedFlow, end: str) -> float:
         """The relative energy error, above rest, of a few in a row with such ends: the median over states."""
-        few: Any = self.lattice.subsystem()
+        few = self.lattice.subsystem()
+        assert few.local is not None
         row = self.lattice.subsystem((COPIES * few.local.shape[0], *few.local.shape[1:]), (end, *few.local.ends[1:]))
         domain = self.states.of(row)
         x = states(domain, ENDS_STATES, 0, Stream.VALIDATION)
@@ -132,7 +141,7 @@ PROBE = 1e-6
 """Step of differences, in units of Δt or of the number that is changed, if that is more."""
 
 
-class EnergyRuns(Problem):
+class EnergyRuns(RunsFit):
     """Relative energy errors in runs of a lattice, as a function of the frozen parameters of a flow."""
 
     compiled = True
@@ -197,7 +206,8 @@ def check_runs(system: HamiltonianSystem, fit: PrimedFit) -> None:
 
 def runs_of(subsystem: LatticeSubsystem, runs: int, seed: int, fitted: PrimedFlow) -> EnergyRuns:
     """Return the energy errors in so many runs of a larger subsystem, by the numbers of a flow of the subsystem."""
-    whole: Any = subsystem.lattice
+    whole = subsystem.lattice
+    assert whole.local is not None
     larger = whole.subsystem(*whole.local.many())
     domain = subsystem.states.of(larger)
     x = states(domain, runs, seed, Stream.RUNS)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -128,7 +129,7 @@ class Objective:
         loss, points, flow, tangents = self.loss, self.points, self.flow, self.tangents
         blocks: list[_Block | _Compiled] = []
         if loss.residual_weight and tangents is not None:
-            blocks.append(_Compiled(loss.residual_weight, loss, flow, tangents, *points.residual))
+            blocks.append(_CompiledResidual(loss.residual_weight, loss, flow, tangents, *points.residual))
         elif loss.residual_weight:
             blocks.append(_Block(loss.residual_weight, flow, loss.residual, points.residual))
         if loss.matching_weight:
@@ -140,7 +141,7 @@ class Objective:
             assert points.labels is not None
             t, x, y, *t0 = points.labels
             if tangents is not None:
-                blocks.append(_Compiled(loss.label_weight, loss, flow, tangents, t, x, *t0, ends=y))
+                blocks.append(_CompiledLabels(loss.label_weight, loss, flow, tangents, t, x, *t0, ends=y))
             else:
                 blocks.append(_Block(loss.label_weight, flow, loss.label_error, points.labels))
         return blocks
@@ -173,23 +174,25 @@ class _Block:
         return weight * values.flatten(leading)
 
 
-class _Compiled:
-    """The residual of a flow of networks, or its errors at labels with these `ends`, by compiled loops."""
+class _Compiled(ABC):
+    """A loss of a flow of networks by compiled loops, one point a row; errors are in units of x over `unit`."""
+
+    by_velocity: ClassVar[bool]
+    """True if d/dt ψ̄_t(x) counts."""
 
     def __init__(
         self,
         weight: float,
+        unit: float,
         loss: Loss,
-        flow: Any,
+        flow: FlowMap,
         tangents: NetworkTangents,
         t: Tensor,
         x: Tensor,
         *t0: Tensor,
-        ends: Tensor | None = None,
     ) -> None:
+        assert isinstance(flow, SympFlow)  # others have no tangents
         self.system, self.tangents, self.t, self.t0 = loss.system, tangents, t, t0
-        self.ends = None if ends is None else ends.detach().numpy()
-        unit = loss.scaling.t if ends is None else 1.0
         self.weights = (weight / len(t)) ** 0.5 * unit / np.array(loss.scaling.x)
         self._parameters = torch.cat([w.detach().reshape(-1) for w in flow.parameters()]).numpy()
         arrays = t, x, flow.step_constants(x, *t0)
@@ -197,34 +200,66 @@ class _Compiled:
 
     def residuals(self) -> Tensor:
         """The residuals (m,), all points of a coordinate after those of the one before."""
-        return self._at(*self._values())
+        return self._weighted(self._errors(*self._values()))
 
     def linearized(self, check: Callable[[], None]) -> tuple[Tensor, Tensor]:
         """The residuals (m,) and their Jacobian (m, n), which the next call for as many points overwrites."""
         check()
         y, velocity = self._values()
-        factors: tuple[np.ndarray, ...]  # the derivatives of the residuals by ψ̄_t(x), and by d/dt ψ̄_t(x)
-        if self.ends is None:
-            of_field = -self._field("field_jacobian", y) * self.weights[:, None]
-            factors = np.ascontiguousarray(of_field), self.weights
-        else:
-            factors = (np.repeat(np.diag(self.weights)[None], len(y), 0),)
-        J = self.tangents.jacobian(self._parameters, *self._points, *factors)
-        return self._at(y, velocity), torch.from_numpy(J.reshape(len(J), -1)).T
+        J = self.tangents.jacobian(self._parameters, *self._points, *self._factors(y))
+        return self._weighted(self._errors(y, velocity)), torch.from_numpy(J.reshape(len(J), -1)).T
 
     def _values(self) -> tuple[np.ndarray, np.ndarray]:
         """ψ̄_t(x), and d/dt ψ̄_t(x) where it counts."""
         t, x, constants = self._points
-        return self.tangents.values(self._parameters, t, x, constants, self.ends is None)
+        return self.tangents.values(self._parameters, t, x, constants, self.by_velocity)
 
-    def _at(self, y: np.ndarray, velocity: np.ndarray) -> Tensor:
-        r = velocity - self._field("vector_field", y) if self.ends is None else y - self.ends
-        return torch.from_numpy((r * self.weights).T.reshape(-1))
+    def _weighted(self, errors: np.ndarray) -> Tensor:
+        return torch.from_numpy((errors * self.weights).T.reshape(-1))
+
+    @abstractmethod
+    def _errors(self, y: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+        """The errors (N, 2d) of y = ψ̄_t(x) and its velocity d/dt ψ̄_t(x)."""
+
+    @abstractmethod
+    def _factors(self, y: np.ndarray) -> tuple[np.ndarray, ...]:
+        """The derivatives of the residuals by y (N, 2d, 2d), and by the velocity (2d,) if it counts."""
+
+
+class _CompiledResidual(_Compiled):
+    """d/dt ψ̄_t(x) − J∇H(ψ̄_t(x))."""
+
+    by_velocity = True
+
+    def __init__(self, weight: float, loss: Loss, *given: Any) -> None:
+        super().__init__(weight, loss.scaling.t, loss, *given)
+
+    def _errors(self, y: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+        return velocity - self._field("vector_field", y)
+
+    def _factors(self, y: np.ndarray) -> tuple[np.ndarray, ...]:
+        return np.ascontiguousarray(-self._field("field_jacobian", y) * self.weights[:, None]), self.weights
 
     def _field(self, name: str, y: np.ndarray) -> np.ndarray:
         """The vector field or its Jacobian at the ends, as torch has it, which any H can do."""
         states = torch.from_numpy(y)
         return getattr(self.system, name)(states, *_later(self.t, states, *self.t0)).detach().numpy()
+
+
+class _CompiledLabels(_Compiled):
+    """ψ̄_t(x) − y of labels y."""
+
+    by_velocity = False
+
+    def __init__(self, weight: float, loss: Loss, *given: Any, ends: Tensor) -> None:
+        super().__init__(weight, 1.0, loss, *given)
+        self.ends = ends.detach().numpy()
+
+    def _errors(self, y: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+        return y - self.ends
+
+    def _factors(self, y: np.ndarray) -> tuple[np.ndarray, ...]:
+        return (np.repeat(np.diag(self.weights)[None], len(y), 0),)
 
 
 class _Evaluation(nn.Module):

@@ -93,7 +93,10 @@ class LBFGSSteps(_TorchSteps):
 class BFGSSteps:
     """BFGS with Oren and Luenberger's self-scaling, limited to growth of the inverse Hessian B: 20 iterations a step.
 
-    On small networks far better than limited-memory BFGS: Urbán, Stefanou, Pons, J. Comput. Phys. 523 (2025) 113656.
+    A B that has learnt the curvature far from the minimum is soon forgotten, so that on small networks it gets orders
+    of magnitude further than limited-memory BFGS [1]_. The line search is SciPy's, for the strong Wolfe conditions.
+
+    .. [1] J. F. Urbán, P. Stefanou, J. A. Pons, J. Comput. Phys. 523 (2025) 113656.
     """
 
     finished: str | None = None

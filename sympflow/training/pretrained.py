@@ -1,4 +1,12 @@
-"""The command that makes the flows that ship again, each by the recipe in its file, and measures their figures: --help.
+"""The command that makes the flows that ship again, each by the recipe in its file, and measures their figures.
+
+python -m sympflow.training.pretrained                                  all of them
+python -m sympflow.training.pretrained henon_heiles --kind sympflow     one
+python -m sympflow.training.pretrained kepler --rung primed-3-0.08      one rung of a ladder of primed flows
+python -m sympflow.training.pretrained kepler --workers 2                the ladder of a scene, by two processes
+python -m sympflow.training.pretrained --measure                        their figures, without training
+python -m sympflow.training.pretrained --measure --keep                 and put them into the files
+python -m sympflow.training.pretrained --identify                       put the H that flows know into the files
 
 A new one is trained by `sympflow.train`, saved in the folder as scene-name.safetensors, and measured with --keep.
 """

@@ -102,7 +102,8 @@ class Session:
     ) -> Generator[Any]:
         """Yield `function(common, item)` of each item in order, by the pool, or by `threads` where that is this one.
 
-        While others work Ctrl-C raises here; then, or if they answer too late, this thread does the rest.
+        While others work Ctrl-C raises KeyboardInterrupt here. After that, or where workers do not answer soon after
+        the deadline, this thread does the rest.
         """
         interruption = self.interruption
         ended = interruption.asked or deadline.left <= 0
@@ -149,7 +150,7 @@ class Session:
         try:
             return Bar(total, label, start)
         except ImportError:
-            return Silent(total, label)
+            return Lines(total, label)
 
 
 @dataclass(frozen=True)
@@ -198,10 +199,7 @@ def _deadline_at(end: float) -> Deadline:
 
 
 class Silent:
-    """Shows nothing; or of so many a line for each validation, where rich is not installed."""
-
-    def __init__(self, total: int = 0, label: str = "") -> None:
-        self.total, self.label = total, label
+    """Shows nothing."""
 
     def __enter__(self) -> Silent:
         return self
@@ -213,8 +211,17 @@ class Silent:
         pass
 
     def tries(self, done: int, what: str) -> None:
-        if self.total:
-            print(f"{self.label} {done}/{self.total}  {what}", file=sys.stderr, flush=True)
+        pass
+
+
+class Lines(Silent):
+    """One line for each validation, where rich is not installed."""
+
+    def __init__(self, total: int, label: str) -> None:
+        self.total, self.label = total, label
+
+    def tries(self, done: int, what: str) -> None:
+        print(f"{self.label} {done}/{self.total}  {what}", file=sys.stderr, flush=True)
 
 
 class Bar(Silent):

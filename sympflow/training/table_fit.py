@@ -1,14 +1,24 @@
 """The fit of a primed flow: the numbers of its splitting table, fitted to the exact flow of a system by Gauss–Newton.
 
-First the table frozen at Δt, a dozen or two numbers, from many random starts, for the cost has many local minima. Then
-the best of these to the end of their narrow valleys, at last with the weight of the energy. Then the polynomials in t,
-from the best tables, to labels at several times in (0, Δt], and other losses. Without labels there is that stage alone.
+In three stages. First the table frozen at Δt, a dozen or two numbers, from many random starts, each followed for a
+few iterations: the cost has many local minima. Then the best of these to the end of their narrow valleys, at last with
+the weight of the energy, with which these are harder to find. Then the polynomials in t, from the best of these tables,
+to labels at several times in (0, Δt].
+
+Other losses (the residual of the flow, Hamiltonian matching) join in the last stage. Without labels there is that stage
+alone, from each start.
+
+Where long runs count, those of a lattice for instance, the best few tables are fitted to these in the end. The best of
+them is the table at Δt, and the polynomials are fitted to the labels before it, if there are as many times as powers.
+
+Every piece of it has a deadline, which each evaluation checks.
 """
 
 from __future__ import annotations
 
 import copy
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, ClassVar
@@ -183,7 +193,7 @@ class TableRun(SearchRun):
         self.table.assign(best.x)
         self._record(best, self._keep_better(session))
 
-    def _completed_by_runs(self, session: Session, runs: Any, finalists: list[Minimum]) -> bool:
+    def _completed_by_runs(self, session: Session, runs: RunsFit, finalists: list[Minimum]) -> bool:
         """Fit the finalists to long runs and take the best; False, with a warning, where there are none to compare."""
         labels = self.weighted or self.frozen
         assert labels is not None
@@ -373,8 +383,17 @@ class StackedFit(Problem):
         return np.concatenate([w * r for w, r, _ in pieces]), np.concatenate([w * J for w, _, J in pieces])
 
 
-MadeRuns = Callable[[PrimedFlow], Any]
-"""Errors in long runs by the frozen parameters of a flow's table: see `sympflow.training.lattice_fit.EnergyRuns`."""
+class RunsFit(Problem, ABC):
+    """Errors in long runs by the frozen parameters of a table."""
+
+    record: dict[str, Any]
+
+    @abstractmethod
+    def parameters(self, theta: np.ndarray) -> np.ndarray:
+        """The flow's parameters that make the table of `theta` at Δt."""
+
+
+MadeRuns = Callable[[PrimedFlow], RunsFit]
 
 
 class Restricted(Problem):

@@ -1,4 +1,7 @@
-"""A splitting step and its derivatives by the numbers of its table; arrays are feature-major: q (d, P).
+"""A splitting step and its derivatives with respect to the numbers of its table.
+
+The step needs the forces of a system and their Jacobians: F = −∇V, G = ∇²V v and C = −∇(½ v·∇²V v), with v = M⁻¹∇V; or
+after F the −∇q^m of each monomial. Arrays are feature-major: q and F, G, C are (d, P), Jacobians (d, d, P).
 
 A driven system is the autonomous one of positions (q, t, s) and momenta (p, 1, E), with V(q, t + s), M⁻¹ extended by 1
 for the velocity of t in drifts, by 0 in v and for s, which stays 0, and the forces (−∂V/∂q, 0, −∂V/∂t). So the
@@ -21,6 +24,7 @@ from sympflow.schemes import CURVATURE, FORCE_GRADIENT
 from sympflow.training.least_squares import Check
 
 if TYPE_CHECKING:
+    from sympflow.kernels.pairs import PairForces
     from sympflow.kernels.table_loops import LabelErrors, TableLoops
 
 ALONG = 1e-4  # length of the difference, relative to q, that gives the third derivative of V along M⁻¹∇V
@@ -73,7 +77,7 @@ class TableStep:
             self.loops = table_loops(system.form, each, int(level), monomials, system.friction)
 
     @cached_property
-    def _forces(self) -> Any:
+    def _forces(self) -> ArrayForces | PairForces:
         return forces_of(*self._forces_of)
 
     def _opened(self, y: np.ndarray, t0: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
@@ -204,7 +208,9 @@ def _velocity(system: HamiltonianSystem, of_time: float, p: np.ndarray) -> np.nd
 # forces ---------------------------------------------------------------------------------------------------------
 
 
-def forces_of(system: HamiltonianSystem, level: int, monomials: Monomials = (), compiled: bool = False) -> Any:
+def forces_of(
+    system: HamiltonianSystem, level: int, monomials: Monomials = (), compiled: bool = False
+) -> ArrayForces | PairForces:
     """The forces of a separable system with T = ½ pᵀM⁻¹p: compiled ones of pairs, else those of its functions."""
     if compiled and system.local is not None and system.local.loops == "pairs":
         from sympflow.kernels.pairs import PairForces

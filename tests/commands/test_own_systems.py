@@ -60,7 +60,8 @@ def files(tmp_path, monkeypatch):
 
 
 def test_a_formula_in_a_file_is_the_system_of_the_same_formula():
-    scene, y = one_scene(["quartic.toml"]), np.array([[0.3, -0.7], [1.1, 0.2]])
+    scene = one_scene(["quartic.toml"])
+    y = np.array([[0.3, -0.7], [1.1, 0.2]])
     expected = y[:, 1] ** 2 / 2 + y[:, 0] ** 2 / 2 + 0.5 * y[:, 0] ** 4 / 4
     np.testing.assert_allclose(scene.system.hamiltonian(y), expected, rtol=1e-15)
     assert (scene.key, scene.system.name, scene.system.t_span, scene.system.dt) == ("quartic", "quartic", (0, 2), 0.1)

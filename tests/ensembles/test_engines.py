@@ -27,7 +27,8 @@ def final(workers, **how):
 
 @pytest.mark.slow
 def test_processes_and_joblib():
-    joblib, expected = pytest.importorskip("joblib"), final(1).final
+    joblib = pytest.importorskip("joblib")
+    expected = final(1).final
     with ProcessPoolExecutor(2, multiprocessing.get_context("spawn")) as pool:
         assert np.array_equal(final(pool).final, expected)
     assert np.array_equal(final(joblib.Parallel(2)).final, expected)
@@ -37,7 +38,8 @@ def test_processes_and_joblib():
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")  # of dask, about what it loses
 def test_a_dask_cluster_one_of_whose_workers_is_killed(tmp_path):
-    distributed, expected = pytest.importorskip("distributed"), final(1).final
+    distributed = pytest.importorskip("distributed")
+    expected = final(1).final
     killed = []
 
     def kill(done, total):

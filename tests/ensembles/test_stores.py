@@ -41,7 +41,8 @@ def test_a_store_holds_the_result(tmp_path, reduce):
 
 
 def test_a_run_goes_on_where_it_ended(tmp_path, monkeypatch):
-    path, written, left = tmp_path / "a.zarr", storage.put_file, 2
+    path, written = tmp_path / "a.zarr", storage.put_file
+    left = 2
 
     def full(place, data, durable=True):
         nonlocal left

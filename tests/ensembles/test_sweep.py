@@ -90,7 +90,8 @@ def test_a_users_function():
     states = kept().y
     assert np.array_equal(result.largest, states[:, 0].max(axis=-1))
     assert np.array_equal(result.ends, states[..., [0, -1]])
-    errors, H = kept(reduce="energy_error").energy_error, SYSTEM.hamiltonian(states.swapaxes(1, 2))
+    errors = kept(reduce="energy_error").energy_error
+    H = SYSTEM.hamiltonian(states.swapaxes(1, 2))
     assert np.allclose(errors, np.abs(H / H[:, :1] - 1).max(1), rtol=1e-9)
 
 
@@ -202,7 +203,8 @@ def test_a_function_that_fails_later_fails_a_row():
 
 def test_numbers_of_a_function_are_kept_or_the_row_fails():
     def kinds(t, y):
-        one, huge = y[0, 0] == STATES[3, 0], y[0, 0] == STATES[4, 0]
+        one = y[0, 0] == STATES[3, 0]
+        huge = y[0, 0] == STATES[4, 0]
         return {"real": 1j if one else 1 + 0j * t[0], "complex": complex(0, 1), "whole": 2**63 if huge else 2**53}
 
     def real_first(t, y):

@@ -191,7 +191,7 @@ LONG_RUNS = {
 
 @pytest.mark.parametrize(("system", "method", "end", "asked"), LONG_RUNS.values(), ids=LONG_RUNS)
 def test_errors_that_grow_beyond_the_trial_runs_are_told(system, method, end, asked):
-    """As large as against an adaptive run of another family, up to the part that half of the step has too."""
+    """The error told is that against an adaptive run of another family, up to the part that half the step has too."""
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
         sol = solve(system, method, (0, end), **asked)

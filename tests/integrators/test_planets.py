@@ -396,7 +396,7 @@ def field_with_extra(t, y, k):
     [("srkn11b", 50.0), ("takahashi_imada", 2.0), ("gauss_legendre6", 50.0), ("rk4", 10.0), ("log_kahan_li8", 50.0)],
 )
 def test_other_methods_have_compiled_steps_with_an_extra_potential(method, dt):
-    """Whose parameters are values that `with_params` changes; steps are so short that k = 1e-5 counts 20 times more."""
+    """Its parameters are values that `with_params` changes; steps are so short that k = 1e-5 counts 20 times more."""
     system = EXTRA.with_params(k=2e-5)
     runs = [solve(system, method, (0, 1000.0), dt=dt, backend=b) for b in ("compiled", "array")]
     assert np.abs(runs[0].y - runs[1].y).max() < 1000 / dt * 40 * EPS * np.abs(system.y0).max()

@@ -85,7 +85,7 @@ def test_every_row_of_the_documented_table_is_executed():
 @pytest.mark.parametrize("method", KINDS)
 class TestEveryTransform:
     def test_derivatives_in_y0(self, method):
-        """By `solve` for one kind, by `odeint` for the next."""
+        """One kind by `solve`, the next by `odeint`."""
         f = problem(method)[(KINDS.index(method) + 1) % 2]
         columns = [(f(Y[0] + h) - f(Y[0] - h)) / 2e-6 for h in 1e-6 * torch.eye(2, dtype=Y.dtype)]
         J = jacobian(f, Y[0])
@@ -200,7 +200,8 @@ class TestNumbersOfH:
 
     @pytest.mark.parametrize("method", ["verlet", "gauss_legendre4"])
     def test_their_derivatives(self, method):
-        k, h = torch.tensor(1.3, dtype=torch.float64), 1e-6
+        k = torch.tensor(1.3, dtype=torch.float64)
+        h = 1e-6
         slope = (self.end(k + h, method) - self.end(k - h, method)) / (2 * h)
         assert slope.abs().min() > 0.1
         for found in (
@@ -410,7 +411,8 @@ class TestBatchesUnderVmap:
         assert seen[1].status == 0
 
     def test_a_batch_within_a_lane(self):
-        batch, f = torch.stack([Y, 0.5 * Y]), problem("gauss_legendre4")[1]
+        batch = torch.stack([Y, 0.5 * Y])
+        f = problem("gauss_legendre4")[1]
         torch.testing.assert_close(vmap(f)(batch), torch.stack([f(y) for y in batch]), **CLOSE)
 
     def test_y0_must_be_finite_in_every_lane(self):

@@ -27,7 +27,8 @@ CLOSE = {"rtol": 1e-13, "atol": 1e-13}
 
 @pytest.mark.parametrize("t_span", SPANS)
 def test_every_peer_makes_the_steps_of_solve(t_span):
-    method, t = "kahan_li8", np.linspace(*t_span, 6)
+    method = "kahan_li8"
+    t = np.linspace(*t_span, 6)
     sol = solve(DRIVEN, method, t_span, t_eval=t, dense_output=True)
     scipy = solve_ivp(DRIVEN, t_span, Y.numpy(), method=as_scipy(method, DRIVEN), t_eval=t, dense_output=True)
     between = 0.7 * t[:-1] + 0.3 * t[1:]
@@ -122,7 +123,8 @@ def test_a_flow_of_a_driven_system_is_told_the_time():
     system = HamiltonianSystem.from_sympy(
         "p**2/2 - cos(q)*(1 + a*cos(w*t))", time="t", params={"a": 0.3, "w": 1.7}, period=2 * np.pi / 1.7, y0=[1, 0.2]
     )
-    flow, times = SympFlow.primed(system, 2, processor=3, dt=0.8), np.array([2.9, 1.75, 1.35])
+    flow = SympFlow.primed(system, 2, processor=3, dt=0.8)
+    times = np.array([2.9, 1.75, 1.35])
     expected = solve(system, flow, (2.9, 1.35), t_eval=times).y
     scipy = solve_ivp(system, (2.9, 1.35), [1, 0.2], method=as_scipy(flow), t_eval=times)
     np.testing.assert_allclose(scipy.y, expected, **CLOSE)

@@ -55,7 +55,8 @@ def test_equal_solve(method, t):
 @pytest.mark.parametrize("method", [*KINDS, "sympflow"])
 class TestValues:
     def test_batches_and_tuples(self, method):
-        y0, t = torch.tensor(HH.domain.sample(6, 1).reshape(2, 3, 4)), times(0.0, 0.5, 1.0)
+        y0 = torch.tensor(HH.domain.sample(6, 1).reshape(2, 3, 4))
+        t = times(0.0, 0.5, 1.0)
         y = odeint(HH, y0, t, method=method, options=options(method))
         assert y.shape == (3, 2, 3, 4)
         q, p = odeint(HH, (y0[..., :2], y0[..., 2:]), t, method=method, options=options(method))
@@ -77,7 +78,8 @@ class TestValues:
 )
 def test_gradients_to_y0_and_t(method, t):
     """At times between grid points, where ψ is smooth in t; a time on the grid has the slope of the step there."""
-    y0, t = torch.tensor(HH.domain.sample(2, 1), requires_grad=True), times(*t).requires_grad_(True)
+    y0 = torch.tensor(HH.domain.sample(2, 1), requires_grad=True)
+    t = times(*t).requires_grad_(True)
     assert torch.autograd.gradcheck(lambda y, s: odeint(HH, y, s, method=method, options={"dt": 0.1}), (y0, t))
 
 
@@ -96,7 +98,8 @@ def test_gradients_of_a_flow_to_y0_t_and_weights(t):
 @pytest.mark.slow
 def test_gradients_of_other_flows(make):
     """Through states and event times, to y0, t and all weights."""
-    psi, y0 = make().requires_grad_(True), times(1.0, 0.2).requires_grad_(True)
+    psi = make().requires_grad_(True)
+    y0 = times(1.0, 0.2).requires_grad_(True)
 
     def states(y, s, *weights):
         return odeint(PENDULUM, y, s, method=psi)
@@ -163,7 +166,8 @@ class TestEvents:
     @pytest.mark.parametrize("reverse", [False, True])
     @pytest.mark.slow
     def test_gradients_of_time_and_state(self, reverse):
-        y0, t0 = times(1.0, 0.2).requires_grad_(True), times(0.1)[0].requires_grad_(True)
+        y0 = times(1.0, 0.2).requires_grad_(True)
+        t0 = times(0.1)[0].requires_grad_(True)
         psi = flow(seed=3)
 
         def of_verlet(y, t):
@@ -251,7 +255,8 @@ class TestAdjoint:
     def test_the_weights_of_a_flow(self, kind):
         """A map without an inverse is run again from its outputs."""
         made = {"layers": flow, "primed": lambda: SympFlow.primed(PENDULUM), "mlp": lambda: MLPFlow(1, hidden=(4,))}
-        psi, y0 = made[kind]().requires_grad_(True), times(1.0, 0.2).requires_grad_(True)
+        psi = made[kind]().requires_grad_(True)
+        y0 = times(1.0, 0.2).requires_grad_(True)
         found = [
             torch.autograd.grad(
                 run(PENDULUM, y0, times(0.0, 0.3, 9.3, 15.0), method=psi).sin().sum(), (y0, *psi.parameters())
@@ -362,7 +367,8 @@ class TestDense:
         torch.testing.assert_close(y(t[2]), expected[2], rtol=0, atol=200 * EPS)
 
     def test_gradients(self):
-        psi, y0 = SympFlow(1, hidden=(2,), dt=0.5), times(1.0, 0.2).requires_grad_(True)
+        psi = SympFlow(1, hidden=(2,), dt=0.5)
+        y0 = times(1.0, 0.2).requires_grad_(True)
 
         def states(y, t, *weights):
             return odeint_dense(PENDULUM, y, 0.0, 2.0, method=psi)(t)

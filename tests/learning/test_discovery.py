@@ -87,7 +87,8 @@ def noisy(H, ndof, seed, n=6, sigma=0.01):
     """Trajectories of a symbolic H over a period or so, with noise."""
     random = np.random.default_rng(seed)
     system = sympflow.HamiltonianSystem.from_sympy(H, y0=[0.7] * (2 * ndof))
-    times, starts = np.linspace(0, 6, 31), random.uniform(-1, 1, (n, 2 * ndof))
+    times = np.linspace(0, 6, 31)
+    starts = random.uniform(-1, 1, (n, 2 * ndof))
     y = np.stack([sympflow.solve(system, "gauss_legendre6", (0, 6), x, t_eval=times, dt=0.05).y for x in starts])
     return times, y + sigma * random.normal(size=y.shape)
 

@@ -55,7 +55,8 @@ def problem(model, data, sigma, **options):
 
 @pytest.mark.parametrize(("rate", "missing"), [(0.0, 0.0), (RATE, 0.0), (0.0, 0.1)], ids=["H", "friction", "gaps"])
 def test_shooting_finds_h_and_friction_to_rounding_where_numbers_are_missing_too(rate, missing):
-    runs, rng = trajectories(8, 15, rate), np.random.default_rng(1)
+    runs = trajectories(8, 15, rate)
+    rng = np.random.default_rng(1)
     for _, y in runs:
         y[rng.random(y.shape) < missing] = np.nan
     data = Trajectories.read(runs)
@@ -87,7 +88,8 @@ def test_derivatives_are_those_of_the_orbits(force, driven):
     if driven:
         model = replace(model, parts=(*model.parts, Drive(Polynomial.up_to(2, "q", [1.0]), 1.3)))
     theta, problem_ = problem(model, data, data.scales)
-    theta, batch, states = theta + 0.05, problem_.batches[0], first_states(data)
+    theta = theta + 0.05
+    batch, states = problem_.batches[0], first_states(data)
     *_, (_, _, X) = problem_._orbits(batch, theta, states, True)
 
     def end(theta, states):
@@ -249,7 +251,8 @@ def test_central_fields_are_found(force, V, observed):
     constraints = _constraints(data, None, None, False, None, None)
     candidates = [*FAMILIES["central"].models(constraints)][: 1 if observed == "qp" and force is KEPLER[0] else None]
     found = [fitted(candidate.model, data, Setting()) for candidate in candidates]
-    best, y = min(found, key=lambda one: one.loss(np.full(4, 1e-3))), np.concatenate(orbits, axis=1)
+    best = min(found, key=lambda one: one.loss(np.full(4, 1e-3)))
+    y = np.concatenate(orbits, axis=1)
     H = (y[2:] ** 2).sum(0) / 2 + V(np.hypot(*y[:2]))
     learned = best.model.hamiltonian(best.theta, y)
     assert np.ptp(learned - H) < 0.01 * np.ptp(H)
@@ -287,7 +290,8 @@ def test_learn_tells_what_it_did(noisy):
 
 def test_a_learned_flow_brings_its_system(noisy, tmp_path):
     noisy.save(tmp_path / "flow.safetensors")
-    flow, y = sympflow.load(tmp_path / "flow.safetensors"), np.array([0.2, 0.3])
+    flow = sympflow.load(tmp_path / "flow.safetensors")
+    y = np.array([0.2, 0.3])
     assert flow.system.hamiltonian(y) == pytest.approx(noisy.system.hamiltonian(y), rel=1e-12)
     assert flow.figures == noisy.figures
 
@@ -580,7 +584,8 @@ def test_a_flow_of_data_that_do_not_tell_h_is_of_these_data():
 def test_chaotic_trajectories_are_followed_in_pieces():
     """Hénon–Heiles at an energy of 0.16, over ten times 1/λ: errors grow by e^10, but not in pieces."""
     system = sympflow.systems.henon_heiles()
-    y0, t = np.array([[0.0, 0.1, 0.549, 0.0], [0.0, -0.1, 0.52, 0.15]]), np.linspace(0, 100, 251)
+    y0 = np.array([[0.0, 0.1, 0.549, 0.0], [0.0, -0.1, 0.52, 0.15]])
+    t = np.linspace(0, 100, 251)
     y = sympflow.solve(system, "kahan_li8", (0, 100), y0, t_eval=t, dt=0.05).y
     data = Trajectories.read((t, y + 5e-3 * np.random.default_rng(0).normal(size=y.shape)))
     model = Model(2, (known_kinetic(np.eye(2)), Polynomial("q", [[2, 0], [0, 2], [2, 1], [0, 3]], [1.0, 1.0])))

@@ -46,7 +46,8 @@ def test_missing_values_stay_missing_and_empty_points_go():
 
 
 def test_results_of_solvers_are_read():
-    system, states = pendulum(), np.array([[1.0, 0.0], [0.5, 0.2]])
+    system = pendulum()
+    states = np.array([[1.0, 0.0], [0.5, 0.2]])
     sol = sympflow.solve(system, "verlet", (0, 1), states, t_eval=t)
     assert_same(Trajectories.read(sol), [(t, sol.y[0]), (t, sol.y[1])])
     assert_same(Trajectories.read([sol, sol]), [(t, y) for y in (*sol.y, *sol.y)])

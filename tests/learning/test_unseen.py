@@ -37,7 +37,8 @@ def test_an_offset_is_no_function():
 
 def test_bodies_at_one_distance():
     """Their place is no function of distances, and is not looked at."""
-    bodies, place = np.array([[0, 1], [2, 3]]), random.normal(size=(400, 2))
+    bodies = np.array([[0, 1], [2, 3]])
+    place = random.normal(size=(400, 2))
     q = np.concatenate([place, place + np.concatenate([np.cos(angle), np.sin(angle)], axis=1)], axis=1)
     states = np.concatenate([q, random.normal(size=q.shape)], axis=1)
     part = Distances.between(bodies, (2,), 1.0)

@@ -36,7 +36,8 @@ def observations(system, observed, runs=5, noise=0.0):
 def accelerations(model, theta, y):
     """q'' of a model at observations (2d, N)."""
     x = model.states(theta, y)
-    field, velocities = model.field(theta, x, False, False).value, replace(model, velocities=True)
+    field = model.field(theta, x, False, False).value
+    velocities = replace(model, velocities=True)
     return velocities.observed(theta, x, field[:, None])[1][model.ndof :, 0]
 
 
@@ -88,8 +89,10 @@ def test_angles_that_nobody_told_of_are_tried(period, spread, names):
 def test_what_is_observed_of_a_state_has_the_derivatives_that_are_said(inertial, force):
     data, _ = observations(double_pendulum() if inertial else CARTS, "qv")
     model = candidate("inertia" if inertial else "polynomial", data, 1, 2 * np.pi if inertial else None)
-    model, rng, h = replace(model, force=force), np.random.default_rng(0), 1e-6
-    theta, y = rng.uniform(0.1, 0.2, model.n), data.runs[0].y[:, ::20]
+    model = replace(model, force=force)
+    rng, h = np.random.default_rng(0), 1e-6
+    theta = rng.uniform(0.1, 0.2, model.n)
+    y = data.runs[0].y[:, ::20]
     x = model.states(theta, y)
     assert model.observed(theta, x, None)[0] == pytest.approx(y, abs=1e-12)
     X = np.concatenate([np.eye(4), np.zeros((4, model.n))], axis=1)[..., None] * np.ones(x.shape[1])
@@ -144,7 +147,8 @@ def test_the_noise_of_velocities_biases_nothing():
 def test_learn_gives_h_and_the_momenta():
     spring = sympflow.HamiltonianSystem.from_sympy("p**2 + q**2", name="spring")
     data, y = observations(spring, "qv", noise=0.005)
-    flow, v = sympflow.learn(data, family="polynomial", dt=0.5), 2 * y[:, 1, 0]
+    flow = sympflow.learn(data, family="polynomial", dt=0.5)
+    v = 2 * y[:, 1, 0]
     p = flow.system.momenta(y[:, :1, 0], v[:, None])
     assert p[:, 0] == pytest.approx(v, abs=1e-12)
     made = sympflow.solve(flow.system, flow, (0, 2), np.stack([y[:, 0, 0], p[:, 0]], 1), t_eval=t).y

@@ -235,7 +235,8 @@ def in_pairs():
 )
 def test_vectors_of_large_systems_are_moved_by_the_derivative_of_the_step(name, method):
     system = in_pairs() if name == "pairs" else HamiltonianSystem.lattice(**LATTICES[name])
-    integrator, rng = build(method, {"dt": 0.1}), np.random.default_rng(3)
+    integrator = build(method, {"dt": 0.1})
+    rng = np.random.default_rng(3)
     y, W = rng.normal(size=(2, 2 * system.ndof)), rng.normal(size=(2, 2 * system.ndof, 3))
     h = np.array([0.1, -0.2])
     moved = integrator.jvp(system, 0.0, y, h, W)

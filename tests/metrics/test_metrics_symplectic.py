@@ -86,7 +86,8 @@ def test_volume_over_time_is_the_running_sum_of_the_steps_that_have_ended():
 
 def test_a_batch_is_judged_trajectory_by_trajectory():
     system = systems.henon_heiles()
-    y0, t = system.domain.sample(6, 0).reshape(2, 3, 4), np.linspace(0, 10, 5)
+    y0 = system.domain.sample(6, 0).reshape(2, 3, 4)
+    t = np.linspace(0, 10, 5)
     for method in ("rk45", "verlet", Damped(dt=0.3)):
         batch = solve(system, method, (0, 10), y0, t_eval=t)
         alone = solve(system, method, (0, 10), y0[1, 2], t_eval=t)
@@ -131,7 +132,8 @@ def test_determinant_one_is_weaker_than_symplectic():
 @pytest.mark.parametrize("method", ["verlet", "kahan_li8", "chin4a", "sympflow"])
 def test_the_metrics_are_those_of_the_precision_that_was_executed(method):
     """The rounding of an entry of A is eps(float32) ≈ 1.2e-7; that of a float64 step would be 2e-16."""
-    eps, system = float(np.finfo(np.float32).eps), systems.henon_heiles()
+    eps = float(np.finfo(np.float32).eps)
+    system = systems.henon_heiles()
     how = shipped(system).to(torch.float32) if method == "sympflow" else method
     sol = solve(system, how, (0, 5), dtype="float32")
     assert sol.y.dtype == np.float32

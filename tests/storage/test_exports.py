@@ -129,7 +129,8 @@ def test_tables_have_a_row_for_each_time():
 
 @needs_data
 def test_tables_of_ensembles():
-    how, states = {"params": {"k": [1.0, 2.0]}}, STATES.reshape(6, 4)
+    how = {"params": {"k": [1.0, 2.0]}}
+    states = STATES.reshape(6, 4)
     result = sympflow.ensemble(OSCILLATOR, "verlet", (0, 1), states, t_eval=TIMES, **how)
     table = result.to_dataframe()
     assert [*table] == ["k", "orbit", "time", "q1", "q2", "p1", "p2", "status"]

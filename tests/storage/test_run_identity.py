@@ -200,7 +200,8 @@ def test_a_digest_is_that_of_another_process_and_changes_with_a_module_of_the_us
 
 
 def test_what_cannot_be_told_from_another_is_said(tmp_path):
-    lock, known = threading.Lock(), Known()
+    lock = threading.Lock()
+    known = Known()
     known.add("reduce", "f", lambda t, y: lock)
     assert known.untold == {"reduce": "an object of _thread.lock"}
     assert known.python == {"reduce"}

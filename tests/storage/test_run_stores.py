@@ -190,7 +190,8 @@ def test_the_outputs_are_read_from_the_store_and_by_xarray(tmp_path):
 
 
 def test_an_output_outside_the_domain_is_told_once(tmp_path):
-    y0, options = np.array([0.0, 0.6, 0.55, 0.0]), {"dt": 0.05, "on_domain_exit": "warn"}
+    y0 = np.array([0.0, 0.6, 0.55, 0.0])
+    options = {"dt": 0.05, "on_domain_exit": "warn"}
     whole = solve(SYSTEM, "verlet", (0, END), y0, **options)
     stored = solve(SYSTEM, "verlet", (0, END), y0, store=tmp_path / "a", **options)
     assert "domain_exit" in whole.stats

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sympflow.arguments import put_file
 from sympflow.storage import store as module
 from sympflow.storage.store import Appender, Field, Store, StoreError, difference
 
@@ -84,8 +85,20 @@ def test_a_full_disk_loses_nothing(tmp_path, monkeypatch):
     assert not list(path.rglob(".new-*"))
 
 
+@pytest.mark.skipif(os.name != "posix", reason="permissions are those of POSIX")
+@pytest.mark.parametrize("mask", [0o022, 0o027, 0o002])
+def test_permissions_follow_the_umask(tmp_path, mask):
+    before = os.umask(mask)
+    try:
+        put_file(tmp_path / "state.pt", b"numbers")
+    finally:
+        os.umask(before)
+    assert (tmp_path / "state.pt").stat().st_mode & 0o777 == 0o666 & ~mask
+
+
 def test_damage_is_told(tmp_path):
-    store, chunk = made(tmp_path / "run.zarr"), tmp_path / "run.zarr" / "dof" / "0"
+    store = made(tmp_path / "run.zarr")
+    chunk = tmp_path / "run.zarr" / "dof" / "0"
     data = bytearray(chunk.read_bytes())
     data[9] ^= 1
     chunk.write_bytes(bytes(data))

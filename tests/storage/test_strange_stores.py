@@ -188,7 +188,8 @@ def test_a_strange_store_is_refused_in_words_and_nothing_else_is_touched(made, t
         (tmp_path / other).mkdir()
         (tmp_path / other / ".state-1.npz").write_bytes(b"mine")
     spoil(tmp_path / "store")
-    before, most = tree(tmp_path), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    before = tree(tmp_path)
+    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     with pytest.raises((ValueError, StoreError), match=r"`store` .*") as caught:
         kept = call(tmp_path / "store", resume=True)
         kept.y if call is run else kept.final  # noqa: B018

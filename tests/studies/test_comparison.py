@@ -103,7 +103,8 @@ def test_a_flow_in_eager_torch_beside_compiled_methods_says_so():
 
 
 def test_a_reference_of_another_problem_is_refused():
-    system, few = systems.pendulum(), {"metrics": ["error"], "t_span": (0, 10), **QUICK}
+    system = systems.pendulum()
+    few = {"metrics": ["error"], "t_span": (0, 10), **QUICK}
     t = np.linspace(0.2, 10, 50)
     other = HamiltonianSystem.from_sympy("p**2/2 + q**2/2 - 1", y0=system.y0)
     with pytest.raises(ValueError, match=r"^`reference` is a solution of another system, 'custom': pass one of 'pen"):

@@ -121,7 +121,8 @@ else:
 
 @pytest.mark.slow
 def test_the_portrait_of_a_flow_in_another_time_is_that_of_its_physical_time():
-    system, flow = systems.kepler(0.6), get("sympflow")(flow="kepler-log-1")
+    system = systems.kepler(0.6)
+    flow = get("sympflow")(flow="kepler-log-1")
     report = compare(system, [flow], ["energy"], t_span=(0, 50), n_outputs=40, repeats=1)
     points = report.figure("portrait").axes[0].lines[1].get_xydata()
     section = poincare_section(system, flow, (0, 50))

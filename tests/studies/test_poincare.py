@@ -159,7 +159,8 @@ DUFFING, KICKED = systems.duffing(), systems.kicked(0.9, 1)
 @pytest.mark.parametrize("n", [3, -1])
 def test_a_stroboscopic_section_has_the_states_after_whole_periods(method, options, n):
     """All N trajectories at once, the start among them, from any t0; fixed steps end there."""
-    T, t0, sign, y0 = DUFFING.period, 0.7, np.sign(n), np.array([[0.5, 0.1], [1.0, -0.2]])
+    T, t0, sign = DUFFING.period, 0.7, np.sign(n)
+    y0 = np.array([[0.5, 0.1], [1.0, -0.2]])
     section = poincare_section(DUFFING, method, (t0, t0 + (n + 0.4 * sign) * T), y0, **options)
     times = t0 + sign * T * np.arange(abs(n) + 1)
     exact = solve(DUFFING, "dop853", (t0, times[-1]), y0, t_eval=times, rtol=1e-12, atol=1e-13)

@@ -38,7 +38,8 @@ def test_the_limit_of_an_oscillator_is_two_at_every_frequency(method, omega):
 )
 def test_the_first_loss_of_stability_is_found_whatever_the_steps(method, first):
     """At ω = 3 the energy is lost from 1.047 on with omelyan4; a sweep that doubles its steps calls 1.788 stable."""
-    system, few = systems.harmonic_oscillator(3.0), {"metrics": ("energy",), "max_steps": 5000}
+    system = systems.harmonic_oscillator(3.0)
+    few = {"metrics": ("energy",), "max_steps": 5000}
     found = [stability(system, [method], steps=steps, **few).limits[0] for steps in ([0.1], [0.3, 1.6], [4.0, 5.0])]
     assert found[0] == found[1] == found[2]
     assert 3 * found[0].stable == pytest.approx(first, abs=6e-5)

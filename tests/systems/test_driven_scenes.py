@@ -113,13 +113,15 @@ def test_adaptive_methods_do_not_step_over_a_quadrupole():
 
 
 def test_runs_land_on_jumps_within_their_steps():
-    cell, t = SCENES["fodo-cell"], sp.Symbol("t", real=True)
+    cell = SCENES["fodo-cell"]
+    t = sp.Symbol("t", real=True)
 
     def system(drive, **scene):
         q, p = sp.symbols("q p", real=True)
         return HamiltonianSystem.from_sympy(p**2 / 2 + q**2 / 2 - q * drive, time="t", y0=[0.5, 0.1], **scene)
 
-    switched, waves = system(sp.Piecewise((0, t < 1.2), (1, True))), system(sp.sign(sp.cos(t)))
+    switched = system(sp.Piecewise((0, t < 1.2), (1, True)))
+    waves = system(sp.sign(sp.cos(t)))
     ramp = system((t - 1.2) * sp.Heaviside(t - 1.2))
     for each, t0, dt in (
         (cell, 0.0, 0.2),

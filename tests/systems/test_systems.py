@@ -136,7 +136,8 @@ def test_kepler_comes_back_after_every_period():
 def test_the_kepler_ellipse_is_the_orbit(e):
     """J∇H along it is dy/dE ÷ dt/dE, t = E − e sin E; angular momentum √(1 − e²)."""
     system, E = systems.kepler(e), np.linspace(0.1, 6, 7)
-    y, step = systems.kepler_ellipse(e, E), 1e-6
+    y = systems.kepler_ellipse(e, E)
+    step = 1e-6
     dy = (systems.kepler_ellipse(e, E + step) - systems.kepler_ellipse(e, E - step)) / (2 * step)
     field = system.vector_field(y)
     np.testing.assert_allclose(dy / (1 - e * np.cos(E))[:, None], field, rtol=1e-6, atol=1e-6 * abs(field).max())
@@ -186,7 +187,8 @@ def test_the_spring_pendulum_starts_on_its_slow_manifold():
 
 
 def test_on_the_separatrix_of_the_double_well():
-    system, t = systems.double_well(), np.linspace(0, 8, 33)
+    system = systems.double_well()
+    t = np.linspace(0, 8, 33)
     sol = solve(system, "dop853", (0, 8), t_eval=t, rtol=1e-13, atol=1e-14)
     exact = math.sqrt(2) / np.cosh(t) * np.array([np.ones(33), -np.tanh(t)])
     np.testing.assert_allclose(sol.y, exact, atol=1e-14 * math.exp(8) * 10)  # errors grow with exp(t)
@@ -292,7 +294,8 @@ def test_bodies_keep_their_momenta():
 
 
 def test_the_outer_solar_system_is_that_of_the_book():
-    system, m, G = systems.outer_solar_system(), celestial.PLANET_MASSES, celestial.G
+    system = systems.outer_solar_system()
+    m, G = celestial.PLANET_MASSES, celestial.G
     q, p = (x.reshape(6, 3) for x in np.split(system.y0, 2))
     v = p / m[:, None]
     np.testing.assert_allclose(q - q[0], celestial.POSITIONS, atol=1e-14)
@@ -347,7 +350,8 @@ def test_the_nonseparable_system_is_solved_by_elliptic_functions(amplitude):
 
 def test_small_oscillations_of_the_double_pendulum():
     """Their frequencies √(2 ± √2), and the second angle ∓√2 times the first."""
-    system, J = systems.double_pendulum(), np.kron([[0, 1], [-1, 0]], np.eye(2))
+    system = systems.double_pendulum()
+    J = np.kron([[0, 1], [-1, 0]], np.eye(2))
     rates, modes = np.linalg.eig(J @ system.hessian(np.zeros(4)))
     order = np.argsort(rates.imag)[2:]
     np.testing.assert_allclose(rates.imag[order], [math.sqrt(2 - math.sqrt(2)), math.sqrt(2 + math.sqrt(2))])
@@ -377,8 +381,10 @@ def test_the_perihelion_of_the_schwarzschild_orbit_advances(semilatus, e):
 
 def test_a_charged_particle_gyrates_and_is_reflected():
     """Frequency B in the plane q₃ = 0, the speed's along the axis; the moment is an adiabatic invariant."""
-    system, B, v = systems.charged_particle(), 10.0, 1.0
-    t, start = np.linspace(0, 2, 9), system.y0 * [1, 1, 1, 1, 1, 0]
+    system = systems.charged_particle()
+    B, v = 10.0, 1.0
+    t = np.linspace(0, 2, 9)
+    start = system.y0 * [1, 1, 1, 1, 1, 0]
     flat = solve(system, "dop853", (0, 2), start, t_eval=t, rtol=1e-12, atol=1e-13).y
     np.testing.assert_allclose(flat[:2], [0.6 - 0.1 * np.cos(B * t), 0.1 * np.sin(B * t)], atol=1e-10)
 

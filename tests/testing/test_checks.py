@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from sympflow import HamiltonianSystem, available, get
+from sympflow import HamiltonianSystem, available, get, systems
 from sympflow.arrays import concatenate, like, per_state, to_numpy
 from sympflow.integrators.base import FixedStep, Outcome, OwnSteps
 from sympflow.integrators.steppers import Stepper
@@ -95,7 +95,8 @@ def refuses_tensors(self, system, t, y, h):
 
 
 def heun(self, system, t, y, h):
-    h, k = np.asarray(per_state(h, y)), np.asarray(system(t, y))
+    h = np.asarray(per_state(h, y))
+    k = np.asarray(system(t, y))
     return (y + h / 2 * (k + np.asarray(system(t, y + h * k)))).astype(y.dtype)
 
 
@@ -301,7 +302,8 @@ def saves_every_step(self, problem):
 
 
 def friction_far_out(self, system, t, y, h):
-    y_next, far = SoundVerlet.step(self, system, t, y, h), (y * y).sum(-1) > 0.5
+    y_next = SoundVerlet.step(self, system, t, y, h)
+    far = (y * y).sum(-1) > 0.5
     return y_next * (1 - 1e-3 * (far.to(y.dtype) if torch.is_tensor(y) else np.asarray(far, y.dtype)))[..., None]
 
 
@@ -354,7 +356,8 @@ class Rk4(FixedStep):
         return system.vector_field(y, t + c * h)
 
     def step(self, system, t, y, h):
-        s, k = per_state(h, y), self.slope(system, t, y, 0.0, h)
+        s = per_state(h, y)
+        k = self.slope(system, t, y, 0.0, h)
         total = k
         for c, weight in ((0.5, 2), (0.5, 2), (1.0, 1)):
             k = self.slope(system, t, y + c * s * k, c, h)
@@ -437,6 +440,9 @@ def test_a_class_without_a_name_is_refused():
 def test_a_method_that_does_not_apply_to_the_system_is_refused():
     with pytest.raises(ValueError, match=r"^`method` 'verlet' needs a separable system"):
         check_integrator(get("verlet"), HamiltonianSystem.from_sympy("(p**2 + 1)*(q**2 + 1)/2", y0=[0.1, 0.2]))
+    for system, has in ((systems.damped_pendulum(), "has friction"), (systems.driven_pendulum(), "is driven")):
+        with pytest.raises(ValueError, match=rf"^`system` .* {has}, .*: leave `system` out"):
+            check_integrator(get("verlet"), system)
 
 
 def test_what_makes_no_integrator_is_refused():
