@@ -7,6 +7,7 @@ import importlib.util
 import json
 import math
 import re
+import subprocess
 import sys
 from pathlib import Path
 
@@ -467,3 +468,21 @@ def test_a_tiny_race_where_h_does_not_split(tmp_path, monkeypatch):
     cells = gauss.split("|")
     assert all(cells[k].strip().startswith("**") for k in (3, 5))  # the only one there
     assert "—" not in gauss
+
+
+SMALL = {
+    "training_starts": ["--quick"],
+    "training_step": ["--points", "20", "--rounds", "1"],
+    "driven": ["--only", "cost", "--rounds", "1"],
+    "friction": ["--steps", "1000", "--rounds", "1"],
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SMALL)
+def test_benchmarks_of_parts_run(name):
+    """Those that use what is inside of the package, in miniature."""
+    script = Path(again.__file__).with_name(f"{name}.py")
+    done = subprocess.run([sys.executable, str(script), *SMALL[name]], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout
