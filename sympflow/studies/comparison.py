@@ -480,7 +480,9 @@ def _upright(columns: Sequence[Column]) -> str:
 def _columns(rows: Sequence[Row]) -> list[Column]:
     titles = [title for title in CELLS if title not in ("batch", "rtol", "±", "steps", "leaves domain at t")]
     own: dict[str, Callable[[Row], str]] = {
-        "step": lambda row: CELLS["step"](row) if row.tolerance is None else f"rtol {CELLS['rtol'](row)}",
+        "step": lambda row: (
+            CELLS["step"](row) if row.dt is not None or row.tolerance is None else f"rtol {CELLS['rtol'](row)}"
+        ),
         "run time": lambda row: (
             f"{seconds(row.run_time)} ± {100 * row.run_time_spread / row.run_time:2.0f} %"
             if row.run_time and row.run_time_spread is not None
