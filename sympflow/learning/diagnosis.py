@@ -176,7 +176,8 @@ def best_by_increments(
 ) -> tuple[int, Reading | None, dict[int, float]] | None:
     """The place of the plainest of the models that explain held-out increments best, a doubt, and squares by places.
 
-    The doubt, if any, is a reading of the data that leaves much less than all models. None in place of all for too few points.
+    The doubt, if any, is a reading of the data that leaves much less than all models. None in place of all for too few
+    points.
     """
     scales, d, fitted, others = data.scales, data.ndof, data.sample, held.sample
     affordable = [k for k, model in enumerate(models) if affords(fitted, model)]
