@@ -232,10 +232,9 @@ METHODS = [*ANY, "verlet", "srkn11b", "chin4a", "kahan_li8", "strang_parts", "li
 @pytest.mark.parametrize(
     ("kind", "method"),
     [
-        (kind, m)
+        pytest.param(kind, m, marks=pytest.mark.slow if (i + k) % 2 else ())
         for i, kind in enumerate(SYSTEMS)
         for k, m in enumerate(ANY if "general" in kind else METHODS)
-        if (i + k) % 2 == 0
     ],
 )
 def test_every_method_runs_as_for_the_same_text(kind, method):
