@@ -451,7 +451,9 @@ class Code:
         symbol = table.symbol
         TABLES[symbol] = table
         self.module.declare(symbol, f"@{symbol} = external global double")
-        self.module.declare(f"{symbol}.place", f"@{symbol}.place = internal externally_initialized global ptr @{symbol}")
+        self.module.declare(
+            f"{symbol}.place", f"@{symbol}.place = internal externally_initialized global ptr @{symbol}"
+        )
         return self.load(Value(self, POINTER, f"@{symbol}.place"), 0, POINTER)
 
     def array(self, name: str, values: Iterable[Any], type: Type = DOUBLE) -> Value:

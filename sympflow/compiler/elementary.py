@@ -526,7 +526,7 @@ def _interval(table: Table, x: Value) -> Value:
     code, last = x.code, len(table) - 2
     if width := table.spacing:
         place = _floor((x - float(table.values[0])) * (1.0 / width))
-        place = where(0.0 <= place, place, 0.0)
+        place = where(place >= 0.0, place, 0.0)
         return where(place <= float(last), place, float(last))
     start, type = code.table(table), x.type.of("i64")
 

@@ -1,7 +1,7 @@
 """Splines of SciPy in functions that are traced: their polynomials, with coefficients in tables.
 
-Along each axis a spline is Σ_j N_j(x) c_{i+j}, where i is the interval that x lies in and each N_j a polynomial there of
-its own; of several axes it is the product. A spline of one axis by its polynomials is the case of one N and no c.
+Along each axis a spline is Σ_j N_j(x) c_{i+j}, where i is the interval that x lies in and each N_j a polynomial there;
+of several axes it is the product. A spline of one axis by its polynomials is the case of one N and no c.
 """
 
 from __future__ import annotations
@@ -221,7 +221,8 @@ def _of_product(spline: Any, xi: Any, nu: Any, beyond: Any) -> Any:
 def _called_grid(spline: Any, xi: Any, method: Any = None, *, nu: Any = None) -> Any:
     if not isinstance(xi, tuple) and np.ndim(xi) == 1:
         raise NotRecorded(
-            "a RegularGridInterpolator gives shape (1,) for one state: call it with coordinates, V((q[..., 0], q[..., 1]))"
+            "a RegularGridInterpolator gives shape (1,) for one state: call it with coordinates, "
+            "V((q[..., 0], q[..., 1]))"
         )
     if method not in (None, spline.method) or spline.method not in ("cubic", "quintic"):
         raise NotRecorded("it has a RegularGridInterpolator with kinks: pass method='cubic'")

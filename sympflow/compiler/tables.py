@@ -63,7 +63,7 @@ class Table:
 def entry_of(table: Table, i: Any, offset: float) -> Any:
     """Return the numbers at the places i + offset, whole numbers as floats: of arrays or tensors."""
     if isinstance(i, np.ndarray | float | np.generic):
-        return table.values[np.asarray(i + offset, dtype=np.int64)]
+        return table.values[np.asarray(np.add(i, offset), dtype=np.int64)]
     import torch
 
     return torch.as_tensor(table.values.copy(), dtype=i.dtype, device=i.device)[(i + offset).long()]

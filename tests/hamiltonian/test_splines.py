@@ -52,7 +52,7 @@ POTENTIALS = {
     "RegularGridInterpolator": (lambda q: bounded((q[..., 0], q[..., 1])), 2),
     "quintic": (lambda q: quintic((q[..., 0], q[..., 1])), 2),
     "three axes": (lambda q: volume((q[..., 0], q[..., 1], q[..., 2])), 3),
-    "NdBSpline": (lambda q: tensor(q), 3),
+    "NdBSpline": (tensor, 3),
 }
 
 
