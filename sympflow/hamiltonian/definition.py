@@ -13,8 +13,7 @@ import numpy as np
 from sympflow.arrays import Array
 
 if TYPE_CHECKING:
-    from sympflow.hamiltonian.formulas import TracedPoles
-    from sympflow.hamiltonian.poles import Poles
+    from sympflow.hamiltonian.poles import Places
 
 
 def bare_copy(x: Any) -> Any:
@@ -70,7 +69,7 @@ class Definition:
         return self
 
     @property
-    def poles(self) -> Poles | TracedPoles | None:
+    def poles(self) -> Places | None:
         """The places where H is infinite or not a number, over which steps may leap."""
         return None
 
