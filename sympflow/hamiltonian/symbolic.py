@@ -844,7 +844,7 @@ def _modules(library: str, code: list[sp.Expr]) -> list[Any]:
     special = sorted(names - known - {"Max", "Min", "Abs", "Heaviside", "sign", "Piecewise", *BOUNDED})
     if library == "numpy":
         own = {"integer_power": _integer_power, "Heaviside": np.heaviside}
-        return [own | _special_functions(), "scipy", "numpy"] if special else [own, "numpy"]
+        return [own | _special_functions(), "scipy", np] if special else [own, np]  # by its name SymPy loads all of it
     if special:
         raise TypeError(
             f"`expression` holds {', '.join(special)}, which torch has not: solve on NumPy states, with a method that "
