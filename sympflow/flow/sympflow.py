@@ -702,9 +702,9 @@ class SystemFlow(SympFlow, ABC):
             kernels[compensated] = system, flow._compiled_for(system, compensated)
         return kernels[compensated][1]
 
+    @abstractmethod
     def _compiled_for(self, system: HamiltonianSystem, compensated: bool) -> Kernel:
         """The compiled loops of the flow on a system."""
-        raise NotImplementedError
 
 
 def _drive_of(told: Any) -> Drive | None:

@@ -542,13 +542,11 @@ def _hessian_of(f: Callable[[Array], Array], name: str) -> Callable[[Array], Arr
 def _with_torch(
     f: Callable[[Array], Array], x: Array, name: str, tail: tuple[int, ...], reason: tuple[str, bool]
 ) -> Array:
-    """f(x) for a function written with torch; NumPy arrays go through tensors that share their memory.
+    """f(x) for a function written with torch; NumPy arrays go through tensors.
 
     `reason` is why it was not traced, and whether it is written for NumPy's arrays.
     """
-    import torch
-
-    tensor = x if is_tensor(x) else torch.from_numpy(np.ascontiguousarray(x))
+    tensor = as_tensor(x)
     version, value, failure = _version(tensor), None, None
     untraced, of_numpy = reason
     with warnings.catch_warnings() if of_numpy else nullcontext():

@@ -8,7 +8,19 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from sympflow.arrays import Array, concatenate, is_tensor, largest, library, like, of_library, per_state, to_numpy
+from sympflow.arrays import (
+    Array,
+    as_tensor,
+    concatenate,
+    is_tensor,
+    jvp,
+    largest,
+    library,
+    like,
+    of_library,
+    per_state,
+    to_numpy,
+)
 from sympflow.hamiltonian.definition import bare_copy
 from sympflow.hamiltonian.formulas import TracedHamiltonian, recorded
 from sympflow.hamiltonian.friction import FRICTIONLESS, Friction
@@ -377,14 +389,8 @@ class Hamiltonian:
         if self.definition.has_third_derivative:
             return self.definition.third_derivative(q, v, w, *self._time(t, q))
         if self.numba_functions is None and (self.definition.differentiates_itself or is_tensor(q)):
-            import torch
-
-            from sympflow.arrays import jvp
-
-            x, along, other = (torch.as_tensor(each) for each in (q, v, w))
-            found = jvp(lambda z: self.hessian_vector(z, other, t), x, along)[1]
-            return of_library(found, q)
-
+            x, along, other = map(as_tensor, (q, v, w))
+            return of_library(jvp(lambda z: self.hessian_vector(z, other, t), x, along)[1], q)
         return third_derivative(self, q, v, w, t)
 
     def _with_acceleration(self) -> Hamiltonian:
@@ -415,9 +421,9 @@ class Hamiltonian:
         """∇T(p): (..., d) to (..., d)."""
         if not self._separable().quadratic_kinetic:
             return self.definition.kinetic_gradient(p, *self._kinetic_time(t, p))
-        if self.followed_mass is not None and is_tensor(p):
-            mass = self.followed_mass.to(p)
-            return p / mass if mass.ndim < 2 else p @ mass.inverse().mT
+        if self.followed_mass is not None:
+            mass = like(of_library(self.followed_mass, p), p)
+            return p / mass if mass.ndim < 2 else p @ library(p).linalg.inv(mass).mT
         if self.inverse_mass is None:
             return p
         M = like(self.inverse_mass, p)

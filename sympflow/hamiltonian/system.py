@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sympflow.arguments import advice, check_flag, check_positive, checked_count, floats, real_number, told, warn
-from sympflow.arrays import Array, differentiable, is_tensor, one_lane, to_numpy
+from sympflow.arrays import Array, learnable, one_lane, to_numpy
 from sympflow.hamiltonian.definition import bare_copy
 from sympflow.hamiltonian.domain import Domain, domain_of
 from sympflow.hamiltonian.fingerprint import fingerprint
@@ -293,7 +293,7 @@ class HamiltonianSystem(Hamiltonian, Answering):
             if value is not None and not definition.separable:
                 raise TypeError(f"`{argument}` only goes with `potential`: leave it out, it is part of `hamiltonian`.")
         M: Any = mass
-        followed = M if is_tensor(M) and (M.requires_grad or differentiable(M)) else None
+        followed = M if learnable(M) else None
         M = M if followed is None else to_numpy(M)
         inverse_mass, quadratic = checked_inverse_mass(M, d) if definition.separable else None, definition.separable
         K = None if stiffness_matrix is None else checked_stiffness(stiffness_matrix, d)

@@ -15,7 +15,7 @@ from weakref import WeakSet
 import numpy as np
 
 from sympflow.arguments import warn
-from sympflow.arrays import Array, is_tensor, masked, readable, to_numpy
+from sympflow.arrays import Array, masked, readable, to_numpy
 from sympflow.hamiltonian.scales import known_scale, rate_of_motion
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep
@@ -233,7 +233,7 @@ def _steps_of(
     width, length = 2 * problem.system.ndof, integrator.step_length(problem.system)
     y0 = to_numpy(problem.y0).reshape(-1, width)[row]
     known = problem.t_eval is None and problem.save_every == 1 and (length is not None or problem.y0.ndim == 1)
-    for end in () if known or is_tensor(problem.y0) else ends:
+    for end in () if known else ends:
         n_steps = abs(end - problem.t0) / length if length else outcome.stats.get("n_steps", 0)
         if n_steps * width <= MOST_WALKED:
             try:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, cast
 import numpy as np
 
 from sympflow.arguments import check_flag
-from sympflow.arrays import Array, is_tensor, to_numpy, transformed, untransformed
+from sympflow.arrays import Array, as_tensor, is_tensor, to_numpy, transformed, untransformed
 from sympflow.flow.known import UNCOMPENSATED, KnownFlow
 from sympflow.flow.shipped import check_tol, choose, forces_saved, named, shipped_flows
 from sympflow.hamiltonian.fingerprint import Identity
@@ -147,7 +147,7 @@ class FlowIntegrator(FixedStep):
         flow = self.flow_for(system)
         if y.dtype == np.float64 and flow.dtype == torch.float64 and flow.device.type == "cpu":
             return flow
-        tensor = y if is_tensor(y) else torch.from_numpy(np.empty(0, y.dtype))
+        tensor = as_tensor(y[..., :0])
         if tensor.dtype == flow.dtype and tensor.device == flow.device:
             return flow
         if self.flow is None:
@@ -164,7 +164,7 @@ class FlowIntegrator(FixedStep):
     def kernel(self, flow: KnownFlow, problem: Problem) -> Any:
         """The compiled loops of the flow, or None where the call needs, or asks for, array operations."""
         system = None
-        if is_tensor(problem.y0) and str(problem.y0.dtype) == "torch.float64":  # for float32 there is another flow
+        if str(problem.y0.dtype) == "torch.float64":  # for float32 there is another flow
             weights = [*cast(Any, flow).parameters()]
             learns = any(x.requires_grad for x in weights) or transformed(*weights)
             system = None if learns else problem.system
