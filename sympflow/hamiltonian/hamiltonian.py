@@ -269,6 +269,14 @@ class Hamiltonian:
         if self.friction:
             raise ValueError(f"`system` {self.called} has friction, p' = −∂H/∂q − Γp, {what}: {remedy}.")
 
+    def check_damped_drifts(self) -> None:
+        """Refuse friction of a kinetic energy that is not quadratic, whose drifts with friction are not known."""
+        if self.friction and not self.quadratic_kinetic:
+            raise ValueError(
+                f"`system` {self.called} has friction, which drifts hold where the kinetic energy is ½ pᵀM⁻¹p: use a "
+                "Runge–Kutta method such as 'dop853'."
+            )
+
     def check_autonomous(self, what: str, remedy: str) -> None:
         """Refuse a driven system, H(t, q, p), by a ValueError with `what` leaves the time out and the remedy."""
         if not self.autonomous:
