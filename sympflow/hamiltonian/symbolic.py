@@ -38,7 +38,6 @@ from sympflow.hamiltonian.driving import (
     with_symbols,
 )
 from sympflow.hamiltonian.expression import COORDINATE, FUNCTIONS, complex_part, of_sympy, stated
-from sympflow.hamiltonian.formulas import recorded
 from sympflow.hamiltonian.jumps import (
     MOST_IMPULSES,
     MOST_POINTS,
@@ -52,6 +51,7 @@ from sympflow.hamiltonian.jumps import (
     split_impulses,
 )
 from sympflow.hamiltonian.poles import Poles, SymbolicPoles
+from sympflow.hamiltonian.recorded import recorded
 from sympflow.hamiltonian.removable import BOUNDED, Max, sinc
 
 LARGEST, TINY = sys.float_info.max, 1e-150
@@ -801,7 +801,7 @@ def _hessian_by_program(
     """∇²f by the first n variables, row by row: the program of f is differentiated sooner than its expression."""
     (f,) = expressions
     try:
-        program = recorded([f], variables)
+        program = recorded(f, variables)
     except NotCompiled:
         return generate(list(hessian(f, variables[:n])), variables, library)
     x = program.inputs[:n]
