@@ -161,7 +161,7 @@ class TestRefusals:
     @pytest.mark.parametrize(
         ("params", "error", "words"),
         [
-            ({"x": 1.0}, ValueError, "no parameter of 'hh', which has lam, m"),
+            ({"x": 1.0}, ValueError, "not a parameter of 'hh', which has lam, m"),
             ({"lam": "a"}, TypeError, "finite real numbers"),
             ({"lam": [True]}, TypeError, "finite real numbers"),
             ({"lam": [1.0, np.nan]}, ValueError, r"lam = nan at \(1,\)"),

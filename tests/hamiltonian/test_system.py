@@ -279,7 +279,7 @@ def test_kinks_and_constants_after_differentiation(q):
 def test_special_functions_run_on_arrays_and_torch_says_that_it_has_none():
     system = made("p**2/2 - besselj(0, q)")
     assert system.force(np.array([0.3]))[0] == pytest.approx(-0.148318816)
-    with pytest.raises(TypeError, match=r"^`expression` holds besselj, which torch has not"):
+    with pytest.raises(TypeError, match=r"^`expression` holds besselj, which torch does not have"):
         system.force(torch.tensor([0.3]))
 
 
