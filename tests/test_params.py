@@ -118,7 +118,7 @@ class TestTrajectories:
     def test_friction_is_no_parameter(self):
         damped = HamiltonianSystem.from_sympy("p**2/2 - g*cos(q)", params={"g": 1.0}, damping=0.1)
         with pytest.raises(
-            ValueError, match=r"'damping', which is not a parameter .* `damping` is not one: make a system for each value"
+            ValueError, match=r"'damping', which is not .* `damping` is not one: make a system for each value"
         ):
             solve(damped, "verlet", (0, 1), [1.0, 0.0], params={"damping": [0.1, 0.2]}, dt=0.1)
 

@@ -105,8 +105,8 @@ def change(*keys, value):
     [
         (change("format", value=99), "format 99 is later"),
         (change("format", value="1"), "no format number"),
-        (change("format", value=0), "format 0 is not"),
-        (change("format", value=-1), "format -1 is not"),
+        (change("format", value=0), "format 0 is unknown"),
+        (change("format", value=-1), "format -1 is unknown"),
         (change("kind", value="pickle"), "kind 'pickle' is unknown"),
         (change("dt", value=-1.0), "dt -1.0"),
         (change("dt", value="1"), "dt '1'"),
