@@ -518,4 +518,4 @@ def _precise(f: sp.Expr, cell: sp.Expr, letters: tuple[sp.Symbol, ...]) -> tuple
 def _slopes(f: sp.Expr, s: sp.Symbol) -> tuple[Any, Any]:
     """The derivative of f in double precision, and in the arithmetic of mpmath."""
     slope = sp.diff(f, s).replace(sp.DiracDelta, lambda *_: sp.S.Zero)
-    return tuple(sp.lambdify(s, slope, modules) for modules in (["scipy", "numpy"], [_BOUNDED, "mpmath"]))
+    return tuple(sp.lambdify(s, slope, modules) for modules in (["scipy", np], [_BOUNDED, "mpmath"]))
