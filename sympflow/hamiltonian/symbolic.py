@@ -135,7 +135,7 @@ class SymbolicHamiltonian(Definition):
             raise ValueError("`expression` must depend on q1 … qd and p1 … pd (or q and p).")
         if ndof - len(used) > MOST_LEFT_OUT:
             raise ValueError(
-                f"`expression` has coordinates of the number {str(ndof)[:20]}, and depends on {len(used)} degrees of "
+                f"`expression` has coordinates numbered up to {str(ndof)[:20]}, and depends on {len(used)} degrees of "
                 "freedom: number them from 1, q1 … qd and p1 … pd."
             )
         if ndof > MOST_COORDINATES:
@@ -604,7 +604,7 @@ def _check_values(H: sp.Expr, values: Mapping[sp.Symbol, sp.Expr]) -> None:
     numbers = [abs(a) for a in H.atoms(sp.Number)]
     if H.has(sp.zoo, sp.nan, sp.oo) or complex_part(H) is not None or any(a > LARGEST for a in numbers):
         shown = ", ".join(f"{s} = {float(value):.9g}" for s, value in values.items() if value.is_number)
-        raise ValueError(f"`params` has {shown}, with which the expression is not a finite real one: change them.")
+        raise ValueError(f"`params` has {shown}, but then the expression is not a finite real one: change them.")
 
 
 def _check_samples(written: sp.Expr, values: Mapping[sp.Symbol, sp.Expr]) -> None:
@@ -874,8 +874,8 @@ def _modules(library: str, code: list[sp.Expr]) -> list[Any]:
         return [own | _special_functions(), "scipy", np] if special else [own, np]  # by its name SymPy loads all of it
     if special:
         raise TypeError(
-            f"`expression` holds {', '.join(special)}, which torch has not: solve on NumPy states, with a method that "
-            "does not need tensors."
+            f"`expression` holds {', '.join(special)}, which torch does not have: solve on NumPy states, with a method "
+            "that does not need tensors."
         )
     import torch
 

@@ -174,7 +174,7 @@ def note_poles(
         passage, which = found[likely[0]], _which(problem, likely, values)
         warn(
             f"H{which} changed for good between t = {passage.begin:.10g} and {passage.end:.10g}, where a step leapt "
-            f"over a place at which it is infinite, {passage.place}: the run means nothing after that. "
+            f"over a place at which it is infinite, {passage.place}: the run is meaningless after that. "
             f"{_remedy(integrator, problem)}.",
             RuntimeWarning,
         )
@@ -361,7 +361,7 @@ def warn_of_long_steps(outcome: Outcome, integrator: Integrator, problem: Proble
     if off > TOO_LONG:
         what, remedy = "`rtol` is too large", "Take rtol=1e-8, or a method of fixed steps with tol=1e-6"
         if dt is not None:
-            what, remedy = f"`dt` {dt:g} is too long", "Take a shorter step, or tol=1e-6, for which it is chosen"
+            what, remedy = f"`dt` {dt:g} is too long", "Take a shorter step, or tol=1e-6, which chooses one"
         warn(f"{what} for method {integrator.label!r}: {told}. {remedy}.", RuntimeWarning)
 
 
@@ -650,7 +650,7 @@ def warn_of_leap(outcome: Outcome, system: HamiltonianSystem, y0: Array) -> bool
     after = f"between t = {outcome.t[first - 1]:.10g} and {outcome.t[first]:.10g}" if first else "by the first output"
     which = "" if len(leapt) == 1 else f" of trajectory {row}, the first of {leapt.sum()},"
     warn(
-        f"The energy{which} went from {H0:.6g} to {H:.6g} over a singularity of V, and the run means nothing after "
+        f"The energy{which} went from {H0:.6g} to {H:.6g} over a singularity of V, and the run is meaningless after "
         f"that. It was lost {after}, where {system.definition.leap(along[first], start)}.",
         RuntimeWarning,
     )

@@ -72,7 +72,7 @@ def _shipped(system: HamiltonianSystem, name: str, tolerance: float | None) -> K
 
 
 def checked_flow(flow: Any, kind: str, what: str) -> Any:
-    """The flow that was given, or the one that ships under the name that was given; a TypeError if it is none."""
+    """The flow that was given, or the one that ships under that name; a TypeError for anything else."""
     if isinstance(flow, str):
         name = flow
         flow = known((name,), lambda: named(name).load())
@@ -440,7 +440,7 @@ class LogSympFlow(FixedStep):
         found = [f for f in shipped_flows(system, "sympflow") if f.shift is not None]
         if not found:
             raise ValueError(
-                f"`flow` is needed, for none in another time ships for {system.name!r}: train one on "
+                f"`flow` is needed: no flow in another time ships for {system.name!r}: train one on "
                 "sympflow.time_transformed(system), or prime one with it, and pass it; or use 'log_leapfrog'."
             )
         return replace(self, flow=found[0].load(system), shift=found[0].shift if self.shift is None else self.shift)

@@ -214,7 +214,7 @@ def _followed_loops(make: Callable[[tuple[str, ...]], Any], problem: Problem) ->
         return loops.varied(problem.parameter_values)
     except NotCompiled as error:
         raise ValueError(
-            f"`params` has {', '.join(names)}, to which no gradient flows: {error} Detach them."
+            f"`params` has {', '.join(names)}, but no gradient flows to parameters here: {error} Detach them."
         ) from error
 
 
