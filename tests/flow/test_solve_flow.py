@@ -76,7 +76,7 @@ def test_float32():
     [
         ({"flow": FLOW, "dt": 1.0}, ValueError, r"^`dt` must be at most the flow's Δt = 0.5"),
         ({"flow": MLP}, TypeError, r"^`flow` must be a trained flow of kind 'sympflow'; got MLPFlow"),
-        ({"flow": "henon_heiles"}, ValueError, r"^`flow` 'henon_heiles' is the name of no flow that ships. Is it"),
+        ({"flow": "henon_heiles"}, ValueError, r"^`flow` 'henon_heiles' does not name a flow that ships. Is it"),
         ({"flow": "henon_heiles-mlp"}, TypeError, r"^`flow` must be a trained flow of kind 'sympflow'; got MLPFlow"),
         ({"flow": SympFlow(1)}, ValueError, r"^`system` .* degrees of freedom"),
         ({"flow": FLOW, "dtype": "float32"}, TypeError, r"^`y0` is .*float32, but the flow's weights .* pass flow.to"),
