@@ -212,8 +212,8 @@ def solve(
     if moving is not None:
         if events is not None or dense_output or store is not None or params is not None:
             raise ValueError(
-                "`t_span` or `t_eval` requires gradients, which flow through no `events`, `dense_output`, `store` or "
-                "`params`: pass `.detach()`, or leave these out; of values for all trajectories make the system, by "
+                "`t_span` or `t_eval` requires gradients, which do not flow through `events`, `dense_output`, `store` "
+                "or `params`: pass `.detach()`, or leave these out; of values for all trajectories make the system, by "
                 "system.with_params(...)."
             )
         t_span, t_eval = moving.numbers
@@ -446,7 +446,7 @@ def _solved_followed(integrator: Integrator, problem: Problem, action: str, rows
     together = replace(problem, parameter_values=parameter_values, followed=followed, diagnosed=False)
     if problem.system.between_impulses is not problem.system or problem.events is not None or action == "stop":
         raise ValueError(
-            f"`params` has {', '.join(rows.followed)} that require gradients, which flow through no `events`, "
+            f"`params` has {', '.join(rows.followed)} that require gradients, which do not flow through `events`, "
             "impulses, or `on_domain_exit` 'stop': detach them, or leave these out."
         )
     integrator.check_followed(together)
@@ -639,7 +639,7 @@ def _fits(outcome: Outcome, y0: Array) -> bool:
 
 
 def _check_outcome(outcome: Any, integrator: Integrator, y0: Array) -> None:
-    """Refuse what is no answer (of a plug-in), and flag states that are not finite, whatever the method says."""
+    """Refuse an invalid answer of a plug-in, and flag states that are not finite, whatever the method says."""
     if not (isinstance(outcome, Outcome) and _fits(outcome, y0)):
         what = type(outcome).__name__
         if isinstance(outcome, Outcome):

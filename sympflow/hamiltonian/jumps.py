@@ -149,7 +149,7 @@ def _sides_of_quotient(a: sp.Function) -> Iterator[tuple[sp.Function, sp.Expr, s
 
 def _values(variables: list[sp.Symbol], expressions: list[sp.Expr]) -> Callable[..., np.ndarray]:
     """The expressions as a function of arrays (...) that returns (k, ...)."""
-    function = sp.lambdify(variables, expressions, ["scipy", "numpy"], cse=True)
+    function = sp.lambdify(variables, expressions, ["scipy", np], cse=True)
 
     def values(*columns: Any) -> np.ndarray:
         with np.errstate(all="ignore"):

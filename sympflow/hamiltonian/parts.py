@@ -335,7 +335,7 @@ def exact_parts(system: HamiltonianSystem, expressions: Sequence[str] | None = N
     by_arrays = system.local is not None or (system.stiffness_matrix is not None and expressions is None)
     if system.written is None or by_arrays:
         if expressions is not None:
-            raise ValueError("`parts` are read as symbols, which the system has not: define it with from_sympy.")
+            raise ValueError("`parts` are read as symbols, and the system has none: define it with from_sympy.")
         if system.local is not None:
             local, rest = system.local.linear_and_rest(abs(system.t_span[1] - system.t_span[0]))
             return ExactParts(local, rest, system.ndof)
@@ -436,7 +436,7 @@ def _parsed(expression: str, system: HamiltonianSystem) -> sp.Expr:
         raise ValueError(f"`parts` has one that is not admissible: {error}") from None
     known = {s.name for s in (*symbols.q, *symbols.p)} | {"q", "p", getattr(time, "name", "q")}
     if foreign := {s.name for s in part.free_symbols} - known:
-        raise ValueError(f"`parts` has {', '.join(sorted(foreign))}, which the system has not: leave it out.")
+        raise ValueError(f"`parts` has {', '.join(sorted(foreign))}, which the system does not have: leave it out.")
     first = {"q": symbols.q[0], "p": symbols.p[0]}
     return part.xreplace({s: first[s.name] for s in part.free_symbols if s.name in first})
 
@@ -530,7 +530,7 @@ def both(y: Array, d: int) -> Array:
 
 
 def mean(x: Array, d: int) -> Array:
-    """The mean of the two copies, in which their difference cancels to first order: (..., 4d) to (..., 2d)."""
+    """The mean of the two copies, (..., 4d) to (..., 2d): their difference cancels to first order."""
     return concatenate([(x[..., :d] + x[..., d : 2 * d]) / 2, (x[..., 2 * d : 3 * d] + x[..., 3 * d :]) / 2])
 
 

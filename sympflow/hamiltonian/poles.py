@@ -59,8 +59,8 @@ class Cancelling(NamedTuple):
         return float(np.nanmax(error) / np.nanmedian(size))
 
 
-class Poles(Protocol):
-    """The places at which H of a system may be infinite, in columns."""
+class Places(Protocol):
+    """The places at which H of a system may be infinite, in columns, as runs look at them."""
 
     cancelling: Sequence[Cancelling]  # terms of H that cancel where each is infinite
     watched: bool  # False if H has cancelling terms alone
@@ -71,7 +71,6 @@ class Poles(Protocol):
     @property
     def exact(self) -> Poles | None:
         """The places by which runs are judged, where these may have passed one; None if they are not known."""
-        return self
 
     def may_pass(self, y: np.ndarray) -> bool:
         """Return False if runs between states y (2, N, 2d) passed no place; True where more is to be looked at."""
@@ -93,8 +92,16 @@ class Poles(Protocol):
         """The values (..., m) that vanish at the places by which H is judged."""
         return np.empty((*y.shape[:-1], 0))
 
+
+class Poles(Places, Protocol):
+    """Such places that are known exactly."""
+
+    @property
+    def exact(self) -> Poles | None:
+        return self
+
     def passed(self, column: int, t: Sequence[float], y: np.ndarray) -> bool:
-        """Return True if H is infinite, or no number, on the way between states y (2, 2d) in two cells."""
+        """Return True if H is infinite or not a number on the way between states y (2, 2d) in two cells."""
 
     def name(self, column: int) -> str:
         """The place, in words that go before "passed"."""
@@ -532,4 +539,4 @@ def _precise(f: sp.Expr, cell: sp.Expr, letters: tuple[sp.Symbol, ...]) -> tuple
 def _slopes(f: sp.Expr, s: sp.Symbol) -> tuple[Any, Any]:
     """The derivative of f in double precision, and in the arithmetic of mpmath."""
     slope = sp.diff(f, s).replace(sp.DiracDelta, lambda *_: sp.S.Zero)
-    return tuple(sp.lambdify(s, slope, modules) for modules in (["scipy", "numpy"], [_BOUNDED, "mpmath"]))
+    return tuple(sp.lambdify(s, slope, modules) for modules in (["scipy", np], [_BOUNDED, "mpmath"]))

@@ -15,7 +15,7 @@ from weakref import WeakSet
 import numpy as np
 
 from sympflow.arguments import warn
-from sympflow.arrays import Array, is_tensor, masked, readable, to_numpy
+from sympflow.arrays import Array, masked, readable, to_numpy
 from sympflow.hamiltonian.scales import known_scale, rate_of_motion
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep
@@ -179,7 +179,7 @@ def note_poles(
         passage, which = found[likely[0]], _which(problem, likely, values)
         warn(
             f"H{which} changed for good between t = {passage.begin:.10g} and {passage.end:.10g}, where a step leapt "
-            f"over a place at which it is infinite, {passage.place}: the run means nothing after that. "
+            f"over a place at which it is infinite, {passage.place}: the run is meaningless after that. "
             f"{_remedy(integrator, problem)}.",
             RuntimeWarning,
         )
@@ -270,7 +270,7 @@ def _steps_of(
     width, length = 2 * problem.system.ndof, integrator.step_length(problem.system)
     y0 = to_numpy(problem.y0).reshape(-1, width)[row]
     known = problem.t_eval is None and problem.save_every == 1 and (length is not None or problem.y0.ndim == 1)
-    for end in () if known or is_tensor(problem.y0) else ends:
+    for end in () if known else ends:
         n_steps = abs(end - problem.t0) / length if length else outcome.stats.get("n_steps", 0)
         if n_steps * width <= MOST_WALKED:
             try:
@@ -398,7 +398,7 @@ def warn_of_long_steps(outcome: Outcome, integrator: Integrator, problem: Proble
     if off > TOO_LONG:
         what, remedy = "`rtol` is too large", "Take rtol=1e-8, or a method of fixed steps with tol=1e-6"
         if dt is not None:
-            what, remedy = f"`dt` {dt:g} is too long", "Take a shorter step, or tol=1e-6, for which it is chosen"
+            what, remedy = f"`dt` {dt:g} is too long", "Take a shorter step, or tol=1e-6, which chooses one"
         warn(f"{what} for method {integrator.label!r}: {told}. {remedy}.", RuntimeWarning)
 
 
@@ -687,7 +687,7 @@ def warn_of_leap(outcome: Outcome, system: HamiltonianSystem, y0: Array) -> bool
     after = f"between t = {outcome.t[first - 1]:.10g} and {outcome.t[first]:.10g}" if first else "by the first output"
     which = "" if len(leapt) == 1 else f" of trajectory {row}, the first of {leapt.sum()},"
     warn(
-        f"The energy{which} went from {H0:.6g} to {H:.6g} over a singularity of V, and the run means nothing after "
+        f"The energy{which} went from {H0:.6g} to {H:.6g} over a singularity of V, and the run is meaningless after "
         f"that. It was lost {after}, where {system.definition.leap(along[first], start)}.",
         RuntimeWarning,
     )

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, cast
 import numpy as np
 
 from sympflow.arguments import check_flag
-from sympflow.arrays import Array, is_tensor, to_numpy, transformed, untransformed
+from sympflow.arrays import Array, as_tensor, is_tensor, to_numpy, transformed, untransformed
 from sympflow.flow.known import UNCOMPENSATED, KnownFlow
 from sympflow.flow.shipped import check_tol, choose, forces_saved, named, shipped_flows
 from sympflow.hamiltonian.fingerprint import Identity
@@ -72,7 +72,7 @@ def _shipped(system: HamiltonianSystem, name: str, tolerance: float | None) -> K
 
 
 def checked_flow(flow: Any, kind: str, what: str) -> Any:
-    """The flow that was given, or the one that ships under the name that was given; a TypeError if it is none."""
+    """The flow that was given, or the one that ships under that name; a TypeError for anything else."""
     if isinstance(flow, str):
         name = flow
         flow = known((name,), lambda: named(name).load())
@@ -147,7 +147,7 @@ class FlowIntegrator(FixedStep):
         flow = self.flow_for(system)
         if y.dtype == np.float64 and flow.dtype == torch.float64 and flow.device.type == "cpu":
             return flow
-        tensor = y if is_tensor(y) else torch.from_numpy(np.empty(0, y.dtype))
+        tensor = as_tensor(y[..., :0])
         if tensor.dtype == flow.dtype and tensor.device == flow.device:
             return flow
         if self.flow is None:
@@ -164,7 +164,7 @@ class FlowIntegrator(FixedStep):
     def kernel(self, flow: KnownFlow, problem: Problem) -> Any:
         """The compiled loops of the flow, or None where the call needs, or asks for, array operations."""
         system = None
-        if is_tensor(problem.y0) and str(problem.y0.dtype) == "torch.float64":  # for float32 there is another flow
+        if str(problem.y0.dtype) == "torch.float64":  # for float32 there is another flow
             weights = [*cast(Any, flow).parameters()]
             learns = any(x.requires_grad for x in weights) or transformed(*weights)
             system = None if learns else problem.system
@@ -440,7 +440,7 @@ class LogSympFlow(FixedStep):
         found = [f for f in shipped_flows(system, "sympflow") if f.shift is not None]
         if not found:
             raise ValueError(
-                f"`flow` is needed, for none in another time ships for {system.name!r}: train one on "
+                f"`flow` is needed: no flow in another time ships for {system.name!r}: train one on "
                 "sympflow.time_transformed(system), or prime one with it, and pass it; or use 'log_leapfrog'."
             )
         return replace(self, flow=found[0].load(system), shift=found[0].shift if self.shift is None else self.shift)

@@ -10,6 +10,7 @@ import numpy as np
 
 from sympflow.arrays import (
     Array,
+    copied,
     differentiable,
     finite_states,
     full_of_nan,
@@ -213,7 +214,7 @@ def _followed_loops(make: Callable[[tuple[str, ...]], Any], problem: Problem) ->
         return loops.varied(problem.parameter_values)
     except NotCompiled as error:
         raise ValueError(
-            f"`params` has {', '.join(names)}, to which no gradient flows: {error} Detach them."
+            f"`params` has {', '.join(names)}, but no gradient flows to parameters here: {error} Detach them."
         ) from error
 
 
@@ -242,25 +243,17 @@ def rollout(
     k = 0
     if carry is not None and carry.running is not None:
         k, y = carry.steps, carry.running
-    tensor = is_tensor(y)
-    out: Any = [] if tensor else np.full((len(save), *y.shape), np.nan, dtype=y.dtype)
-    wanted = save.tolist()
-    position = 0
+    out, wanted = [], save.tolist()
     finite = np.where(finite_states(y, in_any_lane=True), n_steps, -1)
     if wanted and wanted[0] == 0:
-        out.append(y) if tensor else out.__setitem__(0, y)
-        position = 1
+        out.append(copied(y))
     with np.errstate(all="ignore"):
         while k < n_steps and (finite == n_steps).any():
             start, y_start = k, y
             for k in range(start, min(start + block, n_steps)):
                 y = checked_state(step(k, y), y)
-                if position < len(wanted) and wanted[position] == k + 1:
-                    if tensor:
-                        out.append(y)
-                    else:
-                        out[position] = y
-                    position += 1
+                if len(out) < len(wanted) and wanted[len(out)] == k + 1:
+                    out.append(copied(y))
             k += 1
             failed = (finite == n_steps) & ~finite_states(y, in_any_lane=True)
             if failed.any():
@@ -271,17 +264,15 @@ def rollout(
                     finite = np.where(first, j, finite)
     if carry is not None:
         carry.advance(n_steps, y)
-    if tensor:
-        out += [full_of_nan(y)] * (len(wanted) - len(out))
-        out = stack(out, axis=0) if out else y[None][:0]
-    return out, np.asarray(finite)
+    out += [full_of_nan(y)] * (len(wanted) - len(out))
+    return stack(out, axis=0) if out else y[None][:0], np.asarray(finite)
 
 
 def checked_state(y_next: Any, y: Array) -> Array:
     """Return the result of a step from y, checked to be of the same kind, shape and dtype: it may be a plug-in's."""
     shape = getattr(y_next, "shape", None)
     if shape == y.shape and y_next.dtype == y.dtype:
-        if is_tensor(y) and differentiable(y) and not (y_next.requires_grad or transformed(y)):
+        if differentiable(y) and not (y_next.requires_grad or transformed(y)):
             raise TypeError(
                 "`step` loses the gradient of the tensors that it is given: pass NumPy arrays, or y0.detach(). A class "
                 "whose step takes arrays only says so by `arrays_only`."

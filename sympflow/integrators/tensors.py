@@ -81,7 +81,7 @@ class MovingTimes:
 def _moved(system: Any, y: Tensor, t: Tensor, at: Any, sign: float = 1.0) -> Tensor:
     """The same states y (..., 2d) at times t, whose values are `at`, with the derivative by these, or less that."""
     system = system.between_impulses  # which are at times of their own
-    field = system.vector_field(y, None if system.autonomous else torch.as_tensor(at).expand(y.shape[:-1]))
+    field = system.vector_field(y, torch.as_tensor(at).expand(y.shape[:-1]))
     return y + sign * field * (t - t.detach()).to(y)[..., None]
 
 

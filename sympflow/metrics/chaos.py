@@ -262,7 +262,7 @@ def gali(
 
 
 def checked_threshold(below: float) -> float:
-    """`below` as a float; a ValueError if it is no threshold."""
+    """`below` as a float; a ValueError unless it is a threshold."""
     value = as_float(below)
     if not 0 <= value < 1:
         raise ValueError(f"`below` must be a number from 0, to go on to the end, up to 1; got {below!r}.")

@@ -277,7 +277,7 @@ def _refuse_unknown(options: dict[str, Any]) -> None:
 
 
 def _known_system(system: Any, data: Any) -> HamiltonianSystem:
-    """Return H, of which data alone tell nothing."""
+    """Return H; a TypeError for data without a system."""
     is_data = isinstance(system, list | tuple | dict | np.ndarray) or is_tensor(system)
     if not isinstance(system, HamiltonianSystem | str) and (data is not None or system is None or is_data):
         raise TypeError(

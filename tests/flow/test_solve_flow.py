@@ -93,7 +93,7 @@ def test_float32():
     [
         ({"flow": FLOW, "dt": 1.0}, ValueError, r"^`dt` must be at most the flow's Δt = 0.5"),
         ({"flow": MLP}, TypeError, r"^`flow` must be a trained flow of kind 'sympflow'; got MLPFlow"),
-        ({"flow": "henon_heiles"}, ValueError, r"^`flow` 'henon_heiles' is the name of no flow that ships. Is it"),
+        ({"flow": "henon_heiles"}, ValueError, r"^`flow` 'henon_heiles' does not name a flow that ships. Is it"),
         ({"flow": "henon_heiles-mlp"}, TypeError, r"^`flow` must be a trained flow of kind 'sympflow'; got MLPFlow"),
         ({"flow": SympFlow(1)}, ValueError, r"^`system` .* degrees of freedom"),
         ({"flow": FLOW, "dtype": "float32"}, TypeError, r"^`y0` is .*float32, but the flow's weights .* pass flow.to"),
@@ -108,16 +108,6 @@ def test_bad_arguments_are_named(arguments, error, message):
 def test_a_system_without_a_shipped_flow_says_how_to_train_one():
     with pytest.raises(ValueError, match=r"^`system` .* no shipped sympflow flow .* train"):
         solve(systems.harmonic_oscillator(3.7), "sympflow")
-
-
-@pytest.mark.parametrize("batch", [(), (2, 3)])
-@pytest.mark.parametrize("span", [(0.0, 7.3), (7.3, 0.0)])
-def test_compiled_and_array_results_agree_to_rounding(batch, span):
-    kwargs = {"flow": FLOW, "y0": Y0[(0,) * (2 - len(batch))], "on_domain_exit": "ignore"}
-    array = solve(HH, "sympflow", span, backend="array", **kwargs)
-    compiled = solve(HH, "sympflow", span, backend="compiled", **kwargs)
-    assert (array.stats["backend"], compiled.stats["backend"]) == ("torch", "compiled")
-    np.testing.assert_allclose(compiled.y, array.y, atol=1e4 * EPS)  # 15 steps that amplify rounding
 
 
 def test_a_forced_backend_that_does_not_apply_says_why():

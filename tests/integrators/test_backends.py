@@ -103,34 +103,3 @@ def test_steps_are_counted_once():
     sol = solve(HH, "verlet", (0.0, 10.0), dt=0.1, t_eval=[0.05, 10.0])
     assert sol.stats["n_steps"] == 100
     assert solve(HH, "verlet", (0.0, 10.03), dt=0.1).stats["n_steps"] == 101
-
-
-BODIES = HamiltonianSystem.pairs("-m1*m2/r", masses=[1.0, 0.5, 0.3], dim=2)
-CLUSTER = HamiltonianSystem.pairs("-m1*m2/sqrt(r**2 + 0.01)", masses=np.linspace(1.0, 2.0, 10), dim=2, damping=0.1)
-CHAIN = HamiltonianSystem.lattice(
-    shape=12, onsite="k*q**2/2 + q**4/4", bond="r**2/2", params={"k": np.linspace(1, 2, 12)}
-)
-
-
-@pytest.mark.parametrize(
-    ("system", "method", "options"),
-    [
-        (BODIES, "gauss_legendre4", {}),
-        (BODIES, "rk4", {}),
-        (BODIES, "tao4", {"omega": 2.0}),
-        (BODIES, "log_kahan_li8", {}),
-        (CLUSTER, "gauss_legendre4", {}),
-        (CLUSTER, "rk4", {}),
-        (CHAIN, "implicit_midpoint", {}),
-        (CHAIN, "heun3", {}),
-        (CHAIN, "log_kahan_li8", {"shift": 200.0}),
-    ],
-)
-def test_systems_by_one_piece_run_compiled_as_their_terms(system, method, options):
-    y0, run = np.random.default_rng(3).normal(size=2 * system.ndof), {"t_span": (0, 0.05), "dt": 0.01, **options}
-    sol, arrays = (solve(system, method, y0=y0, backend=backend, **run) for backend in ("auto", "array"))
-    assert sol.stats["backend"] == "compiled"
-    np.testing.assert_allclose(sol.y, arrays.y, rtol=0, atol=1e-12)
-    if system is BODIES:
-        text = HamiltonianSystem.from_sympy(str(system.written.H))
-        np.testing.assert_allclose(sol.y, solve(text, method, y0=y0, **run).y, rtol=0, atol=1e-13)

@@ -77,16 +77,6 @@ def test_no_step_is_too_long_for_an_oscillator(method, backend, z):
     assert sol.stats["newton_iterations"] == 2 * n  # a linear system is solved at once; the second finds nothing left
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_compiled_and_array_agree_to_rounding(method):
-    y0 = np.array([[0.6, 0.1, -0.2, 0.5], [0.1, 0.2, 0.3, 0.4]])
-    times = [0.0, 1.23, 5.0]
-    compiled = solve(TURNING, method, (0.0, 5.0), y0=y0, t_eval=times)
-    array = solve(TURNING, method, (0.0, 5.0), y0=y0, t_eval=times, backend="array")
-    assert (compiled.stats["backend"], array.stats["backend"]) == ("compiled", "numpy")
-    np.testing.assert_allclose(compiled.y, array.y, rtol=0, atol=100 * 50 * EPS)
-
-
 @pytest.mark.parametrize(("method", "backend"), [(METHODS[0], "array"), (METHODS[1], "auto")])
 def test_newtons_failure_is_status_minus_one_with_the_time(method, backend):
     hh = systems.henon_heiles()

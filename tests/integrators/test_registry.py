@@ -141,7 +141,7 @@ def test_what_cannot_be_registered(name, integrator, error, message):
 
 @pytest.mark.filterwarnings("ignore:The integrator 'verlet' of")
 def test_plugins_are_not_replaced(plugins):
-    with pytest.raises(ValueError, match=r"^`name` 'good' is that of the plug-in .*choose another name"):
+    with pytest.raises(ValueError, match=r"^`name` 'good' belongs to the plug-in .*choose another name"):
         register("good", FailingStep)
     assert get("good").__name__ == "SymplecticEuler"
 

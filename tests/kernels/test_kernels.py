@@ -184,24 +184,6 @@ def test_numba_systems_of_every_mass_in_batches_and_pickled(mass):
         assert np.abs(Y[:, 0] - plain_run(system, VERLET, 0.1, y0, 10)[-1]).max() < 1e-14
 
 
-@pytest.mark.parametrize(
-    ("scheme", "compensated"),
-    [(VERLET, False), (VERLET, True), (SCHEMES["leapfrog"], False), (EULER, True), (SCHEMES["chin4a"], False)],
-    ids=lambda x: getattr(x, "name", x),
-)
-@pytest.mark.parametrize("n_states", [1, 7, 64, 150])
-def test_batch_agrees_with_single_runs(systems, scheme, n_states, compensated):
-    system = systems["henon_heiles"]
-    loops, save = splitting_loops(system), np.array([0, 3, 300, 600])
-    y0 = system.y0 + np.random.default_rng(0).uniform(-0.02, 0.02, (n_states, 4))
-    Y, n_finite, _ = loops.kernel(scheme, compensated).run(0.1, y0, 600, save, threads=2)
-    assert Y.shape == (n_states, 4, 4)
-    assert (n_finite == 600).all()
-    for i in {0, n_states // 2, n_states - 1}:
-        single, *_ = loops.kernel(scheme, compensated).run(0.1, y0[i], 600, save)
-        assert np.abs(Y[i] - single).max() < 1e-12
-
-
 # --- saves ----------------------------------------------------------------------------------------------------
 
 
