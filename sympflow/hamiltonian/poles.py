@@ -76,10 +76,6 @@ class Places(Protocol):
         """Return False if runs between states y (2, N, 2d) passed no place; True where more is to be looked at."""
         return True
 
-    def ahead(self, y: np.ndarray) -> np.ndarray:
-        """True (N,) for states (N, 2d) from which a free flight meets a place, or may."""
-        return np.ones(len(y), dtype=bool)
-
     def look(
         self, y: np.ndarray, t: Any, numbers: Sequence[Any] = ()
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
@@ -99,6 +95,10 @@ class Poles(Places, Protocol):
     @property
     def exact(self) -> Poles | None:
         return self
+
+    def ahead(self, y: np.ndarray) -> np.ndarray:
+        """True (N,) for states (N, 2d) from which a free flight meets a place, or may."""
+        return np.ones(len(y), dtype=bool)
 
     def passed(self, column: int, t: Sequence[float], y: np.ndarray) -> bool:
         """Return True if H is infinite or not a number on the way between states y (2, 2d) in two cells."""

@@ -203,7 +203,8 @@ def warn_of_collision(outcome: Outcome, integrator: Integrator, problem: Problem
             v, a = (np.asarray(system.gradient(np.concatenate([y0[:, :d], x], axis=1)))[:, d:] for x in (p, force))
             if ((v * a).sum(1) ** 2 < STRAIGHT * (v * v).sum(1) * (a * a).sum(1)).all():
                 return False
-        if not (poles := poles.exact) or not len(rows := np.flatnonzero(poles.ahead(falling))):
+        exact = poles.exact
+        if not exact or not len(rows := np.flatnonzero(exact.ahead(falling))):
             return False
         begin, end = (np.full(len(rows), float(t)) for t in (problem.t0, outcome.t[-1]))
         times, *_ = _end_of_solution(system, begin, y0[rows], end)
