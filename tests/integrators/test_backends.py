@@ -6,7 +6,7 @@ import torch
 
 from sympflow import HamiltonianSystem, solve, systems
 from sympflow.compiler import NotCompiled
-from sympflow.integrators.steppers import compiled_loops
+from sympflow.integrators.loops import compiled_loops
 from sympflow.schemes import SCHEMES
 
 HH = systems.henon_heiles()
