@@ -614,8 +614,8 @@ def _check_samples(written: sp.Expr, values: Mapping[sp.Symbol, sp.Expr]) -> Non
         if isinstance(value, sampled) and all(term.free_symbols <= values.keys() for term in terms if term.has(symbol)):
             raise ValueError(
                 f"`params` has {symbol.name}, a spline, which is a function of the time: in a term without q and p it "
-                "moves nothing. Give a potential by functions, HamiltonianSystem(V, ndof=…, gradient=…); where it is "
-                "the time that is meant, pass time='t'."
+                "moves nothing. Give a potential by a function, HamiltonianSystem(lambda q: V(q[..., 0]), ndof=1); "
+                "where it is the time that is meant, pass time='t'."
             )
 
 
