@@ -83,7 +83,7 @@ def of_functions(V):
     return HamiltonianSystem(lambda q: potential(q[..., 0]), ndof=1)
 
 
-@pytest.mark.parametrize("V", [*CROSSED][::2])
+@pytest.mark.parametrize("V", [pytest.param(V, marks=pytest.mark.slow if i % 2 else ()) for i, V in enumerate(CROSSED)])
 def test_a_run_of_functions_ends_there_too(V):
     y0, dt, t1 = CROSSED[V]
     sols = [solved(f, "verlet", (0, t1), y0, dt=dt)[0] for f in (of_functions(V), in_units(V, 1.0))]

@@ -12,7 +12,6 @@ import pytest
 from sympflow import Scheme, available, compare, get, poincare_section, register, solve, systems
 from sympflow.integrators import registry
 from sympflow.integrators.base import FixedStep
-from sympflow.schemes import SCHEMES
 
 
 @dataclass(frozen=True)
@@ -99,18 +98,6 @@ def plugins(monkeypatch):
     registry._plugins.cache_clear()
     yield
     registry._plugins.cache_clear()
-
-
-def test_all_built_in_methods_are_listed():
-    assert {*SCHEMES, "rk45", "dop853", "dopri5", "sympflow", "mlp"} <= set(available())
-
-
-@pytest.mark.parametrize("name", sorted(SCHEMES))
-def test_integrators_declare_what_they_are(name):
-    integrator = get(name)(dt=0.1)
-    assert (integrator.name, integrator.order, integrator.symplectic) == (name, SCHEMES[name].order, True)
-    assert integrator.options() == ("dt", "compensated", "splitting", "clock", "parts", "shift", "omega", "corrector")
-    assert repr(integrator) == f"{name}(dt=0.1)"
 
 
 def test_registered_classes_solve():
