@@ -23,8 +23,8 @@ from sympflow.integrators.contract import FINISHED
 from sympflow.integrators.diagnosis import try_steps
 from sympflow.integrators.grid import Grid
 from sympflow.integrators.impulses import landings
+from sympflow.integrators.loops import compiled_loops
 from sympflow.integrators.registry import naming_plugin
-from sympflow.integrators.steppers import compiled_loops
 from sympflow.metrics.orbits import OfOrbits, Orbits, checked_orbits, of_many
 from sympflow.show.cards import Card
 from sympflow.show.pictures import curves_figure
