@@ -6,7 +6,7 @@ import torch
 
 from sympflow import HamiltonianSystem, solve, systems
 from sympflow.compiler import NotCompiled
-from sympflow.integrators.steppers import compiled_loops
+from sympflow.integrators.loops import compiled_loops
 
 HH = systems.henon_heiles()
 PLAIN = HamiltonianSystem(lambda q: np.median(q, axis=-1) ** 4, ndof=1, y0=[1.0, 0.0], gradient=lambda q: 4 * q**3)
