@@ -318,7 +318,7 @@ def indicator(
     scale = weights(system)
     w0 = _deviations(deviations, vectors, scale, seed)
     length = integrator.step_length(system) if integrator.on_grid else None
-    told, jumps = landings(integrator, system, t0, t1, backend != "compiled")
+    told, jumps = landings(integrator, system, t0, t1, backend != "compiled", kinks=False)
     if told:
         warn(told, RuntimeWarning)
     if length is not None:
