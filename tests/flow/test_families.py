@@ -77,21 +77,6 @@ def test_a_flow_is_built_again_from_its_architecture(name):
 
 
 @EACH
-def test_a_run_of_kernel_steps_is_one_of_the_flow(name):
-    make, system = FLOWS[name]
-    flow, x = make(), torch.as_tensor(system.y0)
-    z = flow.lift(x, **started(flow))
-    y = flow.prepare(flow.dt, z)
-    for _ in range(3):
-        y = flow.kernel_step(flow.dt, y)
-    end = flow(3 * flow.dt, x, **started(flow))
-    torch.testing.assert_close(flow.project(flow.finish(flow.dt, y)), end, rtol=1e-12, atol=1e-13)
-    if flow.symplectic:
-        back = flow.kernel_step(flow.dt, flow.kernel_step(flow.dt, z), back=True)
-        torch.testing.assert_close(back, z, rtol=1e-12, atol=1e-13)
-
-
-@EACH
 def test_what_is_asked_of_a_flow_map(name):
     make, system = FLOWS[name]
     flow, x = make(), torch.as_tensor(system.y0)
