@@ -101,6 +101,8 @@ class SymbolicHamiltonian(Definition):
     parameters: tuple[sp.Symbol, ...] = ()
     values: tuple[float, ...] = ()
     meanings: tuple[sp.Expr, ...] = ()
+    left_out: sp.Expr = sp.S.Zero
+    """The terms of H without coordinates, in its parameters, which a form does not have."""
     _written: tuple[sp.Expr, dict[sp.Symbol, sp.Expr]] | None = None
     """H as it was written, and the values of its parameters; None without any."""
     time: Any = None
@@ -194,7 +196,10 @@ class SymbolicHamiltonian(Definition):
         except (TypeError, OverflowError):  # a value that is no real number
             return self
         states = {*self.q, *self.p}
-        form = self.like(sp.Add(*[term for term in sp.Add.make_args(H) if term.free_symbols & states]))
+        terms = sp.Add.make_args(H)
+        form = self.like(sp.Add(*[term for term in terms if term.free_symbols & states]))
+        constant = sp.Add(*[term for term in terms if not term.free_symbols & states])
+        form.left_out = constant.xreplace({symbol: part for part, (symbol, _) in symbols.found.items()})
         used = form.H.free_symbols - states - {self.time}
         kept = [(part, *symbol) for part, symbol in symbols.found.items() if symbol[0] in used]
         form.meanings, form.parameters, form.values = (tuple(row[i] for row in kept) for i in range(3))
@@ -558,9 +563,7 @@ class Revalued(SymbolicHamiltonian):
 
     @cached_property
     def _left_out(self) -> float:
-        """The terms of H that depend on no coordinate, which the form has not."""
-        terms = [f for f in sp.Add.make_args(self.written[0]) if f.free_symbols <= self.written[1].keys()]
-        return float(sp.Add(*terms).xreplace(self.written[1]))
+        return float(self._form.left_out.xreplace(self.written[1]))
 
     def _derivative(self, name: str, order: int) -> Callable[..., Array]:
         function, numbers = self._form._derivative(name, order), self._form.values

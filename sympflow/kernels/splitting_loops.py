@@ -183,7 +183,8 @@ class SplittingLoops:
 
             made = term_code(self.splitting(level, monomials, compensated, parametric=False))
         else:
-            from sympflow.kernels.splittings import SplittingCode, shared
+            from sympflow.kernels.rollouts import shared
+            from sympflow.kernels.splittings import SplittingCode
 
             splitting = self.splitting(level, monomials, compensated, ranges or ())
             made = shared(splitting.key, lambda: SplittingCode(splitting))
