@@ -236,7 +236,7 @@ def test_values_with_another_structure_are_a_formula_of_their_own(values):
 def test_values_without_a_meaning_are_refused():
     system = HamiltonianSystem.from_sympy("p**2/(2*m) + sqrt(k)*q**2", params={"m": 2.0, "k": 2.0})
     for values in ({"m": 0.0}, {"k": -2.0}):
-        with pytest.raises(ValueError, match="is not a finite real one|must be real"):
+        with pytest.raises(ValueError, match=r"is not a finite real one|must be real"):
             system.with_params(**values)
 
 

@@ -492,7 +492,7 @@ class SymbolicHamiltonian(Definition):
         self._functions[key] = function
         return function
 
-    _generated = ("_functions", "_switches", "poles")
+    _generated: tuple[str, ...] = ("_functions", "_switches", "poles")
 
     @cached_property
     def _functions(self) -> dict[str, Callable[[Array], Array]]:
@@ -520,7 +520,7 @@ class Revalued(SymbolicHamiltonian):
         self._form.values, self._form._functions, self._form.inverse_mass = numbers, form._functions, form.inverse_mass
 
     @property
-    def parametric(self) -> SymbolicHamiltonian:  # type: ignore[override]
+    def parametric(self) -> SymbolicHamiltonian:
         return self._form
 
     @property
@@ -528,7 +528,7 @@ class Revalued(SymbolicHamiltonian):
         return self._root
 
     @cached_property
-    def H(self) -> sp.Expr:  # type: ignore[override]
+    def H(self) -> sp.Expr:
         written, values = self.written
         return _with_numeric_constants(_valued(written, values, None))
 
@@ -537,15 +537,15 @@ class Revalued(SymbolicHamiltonian):
         return _split(self.H, self.q, self.p)
 
     @property
-    def V(self) -> Any:  # type: ignore[override]
+    def V(self) -> Any:
         return self._parts[0]
 
     @property
-    def T(self) -> Any:  # type: ignore[override]
+    def T(self) -> Any:
         return self._parts[1]
 
     @cached_property
-    def inverse_mass(self) -> Any:  # type: ignore[override]
+    def inverse_mass(self) -> Any:
         M = self._form.inverse_mass
         return M if M is None or not M.free_symbols else M.xreplace(dict(zip(*self._letters, strict=True)))
 
