@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sympflow.arrays import Array, concatenate, detached, is_tensor, library, like, stack
+from sympflow.arrays import Array, concatenate, detached, library, like, stack
 from sympflow.hamiltonian.linear_part import (
     LinearPart,
     RestOfPotential,
@@ -263,7 +263,7 @@ def shears(kinds: Sequence[str], rates: Array, s: Array) -> tuple[Array, Array, 
     """
     module = library(s)
     theta = rates * s
-    k, r = _reduced(theta, 0.0 if is_tensor(s) else _low(rates, s, theta), module)
+    k, r = _reduced(theta, _low(rates, s, theta), module)
     one, zero = 1 + 0 * theta, 0 * theta
     c = module.where(k == 0, one, zero) - module.where(abs(k) == 2, one, zero)
     d = module.where(k == 1, one, zero) - module.where(k == -1, one, zero)
@@ -303,15 +303,16 @@ def _reduced(theta: Array, low: Any, module: Any) -> tuple[Array, Array]:
     return k, module.where(none, r - detached(r), r)
 
 
-def _low(a: np.ndarray, b: np.ndarray, product: np.ndarray) -> np.ndarray:
+def _low(a: Array, b: Array, product: Array) -> Array:
     """The part that rounding took from the product a·b, exactly [Dekker 1971]; 0 where it overflows, or in float32."""
-    if product.dtype != np.float64:
-        return np.zeros_like(product)
+    xp = library(product)
+    if product.dtype != xp.float64:
+        return xp.zeros_like(product)
     with np.errstate(all="ignore"):
         a_high, b_high = (SPLITTER * x - (SPLITTER * x - x) for x in (a, b))
         a_low, b_low = a - a_high, b - b_high
         low = ((a_high * b_high - product) + a_high * b_low + a_low * b_high) + a_low * b_low
-    return np.where(np.isfinite(low), low, 0.0)
+    return xp.where(xp.isfinite(low), low, 0.0)
 
 
 @kept

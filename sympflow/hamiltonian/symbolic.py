@@ -44,12 +44,14 @@ from sympflow.hamiltonian.jumps import (
     MOST_POINTS,
     Impulse,
     Switch,
+    Touch,
     Zeros,
     borders,
     check_continuous,
     has_period,
     refuse_deltas,
     split_impulses,
+    touches,
 )
 from sympflow.hamiltonian.poles import Poles, SymbolicPoles
 from sympflow.hamiltonian.recorded import recorded
@@ -297,12 +299,13 @@ class SymbolicHamiltonian(Definition):
         return bool(self.samples or self._switches)
 
     @cached_property
-    def _switches(self) -> list[Switch]:
-        """Borders at which H may jump in t alone."""
+    def _switches(self) -> list[Switch | Touch]:
+        """Places at which H may jump, or have a kink, in t alone."""
         if self.time is None:
             return []
         own = [border for border in borders(self.H, [self.time], kinks=True) if border.g.free_symbols == {self.time}]
-        return [Switch(border, self.time, self.samples) for border in own]
+        jumping = [Switch(border, self.time, self.samples) for border in own]
+        return [*jumping, *touches(self.H, self.time, self.samples)]
 
     def jump_times(self, low: float, high: float, step: float, kinks: bool = False) -> np.ndarray:
         found = [samples.jump_times(low, high) for samples in self.samples.values()]

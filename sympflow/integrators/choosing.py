@@ -333,7 +333,7 @@ def _error(integrator: FixedStep, problem: Problem, tol_of: str, trial: float) -
         with np.errstate(all="ignore"):
             stepped = replace(integrator, dt=h)
             piece = replace(problem, t1=float(t[-1]), t_eval=t, diagnosed=False)
-            _, jumps = landings(stepped, system, piece.t0, piece.t1, kinks=True)
+            _, jumps = landings(stepped, system, piece.t0, piece.t1)
             outcome = run_in_pieces(lambda *given: (given[0].run(given[1]), given[1]), stepped, piece, jumps)[0]
         nonlocal compiled
         compiled = outcome.stats.get("backend") == "compiled"

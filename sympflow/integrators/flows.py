@@ -30,8 +30,9 @@ from sympflow.integrators.clocks import (
 from sympflow.integrators.contract import Failure, Outcome, Problem, Steps
 from sympflow.integrators.domain_exit import check_start
 from sympflow.integrators.grid_runs import grid_run
+from sympflow.integrators.loops import compiled_loops, with_loops
 from sympflow.integrators.registry import is_flow
-from sympflow.integrators.steppers import ArraySteps, Stepper, compiled_loops, rollout
+from sympflow.integrators.steppers import ArraySteps, Stepper, rollout
 from sympflow.kernels.protocol import RunCheckpoint
 from sympflow.lazy import kept
 
@@ -176,10 +177,10 @@ class FlowIntegrator(FixedStep):
         if type(problem.y0) is np.ndarray and problem.y0.dtype == np.float64:  # a kernel tells the flow's own dtype
             kernel = self.kernel(flow, problem)
             if kernel is not None:
-                return Stepper(self, problem, FlowSteps(flow, True), kernel)
+                return with_loops(self, problem, FlowSteps(flow, True), kernel)
         flow = self.flow_like(problem.system, problem.y0)
         kernel = self.kernel(flow, problem)
-        return Stepper(self, problem, FlowSteps(flow, kernel is not None), kernel)
+        return with_loops(self, problem, FlowSteps(flow, kernel is not None), kernel)
 
     def run(self, problem: Problem) -> Outcome:
         run = grid_run(self, problem)

@@ -28,8 +28,9 @@ from sympflow.integrators.contract import (
     method_class,
 )
 from sympflow.integrators.interpolants import Mapped
+from sympflow.integrators.loops import compiled_loops, stepper_of
 from sympflow.integrators.methods import NAMES, TRIPLES
-from sympflow.integrators.steppers import Stepper, compiled_loops, stepper_of
+from sympflow.integrators.steppers import Stepper
 from sympflow.schemes import CORRECTORS, POLYNOMIAL, SCHEMES, Scheme, checked_scheme, scheme_evaluations, scheme_named
 
 if TYPE_CHECKING:
