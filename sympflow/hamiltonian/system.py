@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NoReturn, TypedDict, Unpack
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.arguments import advice, check_flag, check_positive, checked_count, floats, real_number, told, warn
+from sympflow.arguments import advice, check_flag, check_positive, checked_count, floats, real_number, warn
 from sympflow.arrays import Array, differentiable, is_tensor, one_lane, to_numpy
 from sympflow.hamiltonian.definition import bare_copy
 from sympflow.hamiltonian.domain import Domain, domain_of
@@ -825,7 +825,6 @@ class HamiltonianSystem(Hamiltonian, Answering):
                     has += "; `damping` is not one: make a system for each value"
                 raise ValueError(f"`params` has {name!r}, no parameter of {self.called}, {has}.")
 
-    @told
     def with_params(self, **values: float) -> HamiltonianSystem:
         """The same system with other values of some parameters. Most methods reuse the compiled code.
 

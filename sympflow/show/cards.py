@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
+from sympflow.arguments import told_of_all
+
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
@@ -82,10 +84,14 @@ class Shown(ABC):
 
 
 class Answering(Shown):
-    """An object that says where it has what users look for under other names."""
+    """An object that says where it has what users look for under other names, and how its methods are called."""
 
     _OTHER_NAMES: ClassVar[Mapping[str, str]] = {}
     """These names, and what to take."""
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        told_of_all(cls)
 
     if not TYPE_CHECKING:
 
