@@ -353,6 +353,7 @@ INSTEAD = {
     **dict.fromkeys(("n_jobs", "n_workers", "num_workers"), "sympflow.ensemble has `workers`"),
     "dt": "steps to try are `steps`, and a method with one step is sympflow.get(name)(dt=...)",
     "tol": "the step for a tolerance is that of sympflow.choose_step(system, method, tol)",
+    "budget": "how long is `repeats`, the number of timed runs",
     "plane": "the plane of a section is `coordinate` = `level`",
     "E": "the energy of a section is `energy`",
     "device": "pass `y0` as a tensor on that device",
@@ -401,7 +402,7 @@ def _misfit(function: Callable[..., Any], given: int, options: dict[str, Any]) -
     """The message for a call with so many arguments and these options, which the function does not take."""
     parameters = list(inspect.signature(function).parameters.values())
     *_, owner, name = ["", *function.__qualname__.split(".")]
-    bound = parameters[0].name in ("self", "cls")
+    bound = bool(parameters) and parameters[0].name in ("self", "cls")
     parameters, given = parameters[bound:], given - bound
     call = owner if name == "__init__" else name
     named = [p for p in parameters if p.kind is not p.VAR_KEYWORD]

@@ -150,18 +150,18 @@ class KineticPotential(Composition):
         self.method, self.scheme, self.system = method, scheme, system
         if not system.separable:
             raise ValueError(
-                f"`method` {method!r} needs a separable system, H = T(p) + V(q), and {system.called} is not: use "
+                f"`method` {method!r} needs a separable system, H = T(p) + V(q), and {system.name!r} is not: use "
                 f"{system.definition.instead}."
             )
         if (scheme.nystrom or scheme.level) and not system.quadratic_kinetic:
             raise ValueError(
-                f"`method` {method!r} needs a kinetic energy ½ pᵀM⁻¹p, which {system.called} has not: use a scheme "
+                f"`method` {method!r} needs a kinetic energy ½ pᵀM⁻¹p, which {system.name!r} has not: use a scheme "
                 "for any separable system, such as 'kahan_li8'."
             )
         if system.friction and not system.quadratic_kinetic:
             raise ValueError(
                 f"`method` {method!r} solves friction exactly where the kinetic energy is ½ pᵀM⁻¹p, which "
-                f"{system.called} has not: use a Runge–Kutta method such as 'dop853'."
+                f"{system.name!r} has not: use a Runge–Kutta method such as 'dop853'."
             )
 
     def check_system(self, dt: float) -> None:
@@ -404,7 +404,7 @@ class LinearRest(ExactMaps):
         if scheme.nystrom and any(part.turns for part in self.parts.rest):
             raise ValueError(
                 f"`method` {method!r} has a Nyström scheme, which needs a rest of H that is a potential U(q), and that "
-                f"of {system.called} depends on p too: use 'linear_kahan_li6', 'linear_aba864' or 'impulse'."
+                f"of {system.name!r} depends on p too: use 'linear_kahan_li6', 'linear_aba864' or 'impulse'."
             )
         if scheme.level > FORCE_GRADIENT:
             raise ValueError(
@@ -576,7 +576,7 @@ class KeplerInteraction(Composition):
         frame = frame_of(system)
         if frame is None:
             raise ValueError(
-                f"`method` {method!r} is for planets about a star, which {system.called} is not: make it by "
+                f"`method` {method!r} is for planets about a star, which {system.name!r} is not: make it by "
                 "HamiltonianSystem.planets, or take the splitting 'kinetic', such as 'srkn11b'."
             )
         frame.check(method)

@@ -46,7 +46,7 @@ class Card:
         rows = "".join(
             f"<tr>{cell}<b>{html.escape(label)}</b></td>{cell}{html.escape(cut(value))}</td></tr>"
             for label, value in self.facts.items()
-            if value
+            if value and not (self.formula and label == "H")
         )
         parts = [
             f"<b>{html.escape(self.caption)}</b>" if self.caption else "",

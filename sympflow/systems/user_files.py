@@ -15,7 +15,6 @@ from typing import Any
 
 from sympflow.arguments import did_you_mean
 from sympflow.hamiltonian.domain import Ball, Box, EnergySublevel, Tube, domain_from_dict
-from sympflow.hamiltonian.hamiltonian import UNNAMED
 from sympflow.hamiltonian.lattice_states import LatticeStates
 from sympflow.hamiltonian.system import HamiltonianSystem
 
@@ -143,9 +142,7 @@ def _answering(function: Callable[..., Any], name: str, file: Path) -> Callable[
 
 def _named(system: HamiltonianSystem, name: str) -> HamiltonianSystem:
     """The system, by the name that it has in its file where it has none of its own."""
-    if system.name == UNNAMED:
-        system.name = name
-    return system
+    return system if system.scene.name else system.with_scene(name=name)
 
 
 def _of_toml(file: Path, name: str | None) -> Callable[..., HamiltonianSystem]:
