@@ -27,7 +27,7 @@ from sympflow.flow.weights import checksum
 from sympflow.hamiltonian.domain import EnergySublevel
 from sympflow.hamiltonian.doubling import doubled
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.show.cards import Card, Shown
+from sympflow.show.cards import Card, Shown, brief
 from sympflow.show.pictures import trajectory_figure
 from sympflow.show.style import saved
 
@@ -531,7 +531,7 @@ class FlowMap(KnownFlow, Shown, nn.Module):
             "Δt": f"{self.dt:g}",
             "degrees of freedom": f"{self.ndof:,}",
             "parameters": f"{self.n_parameters:,}",
-            "domain": "" if self.domain is None else repr(self.domain),
+            "domain": "" if self.domain is None else brief(repr(self.domain)),
             **{name: f"{value:.3g}" for name, value in told.items()},
         }
         certificate = "" if self.certified is None else str(self.certified)

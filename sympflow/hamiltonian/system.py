@@ -24,7 +24,7 @@ from sympflow.hamiltonian.friction import Friction
 from sympflow.hamiltonian.hamiltonian import Hamiltonian
 from sympflow.hamiltonian.linear_part import checked_damping, checked_inverse_mass, checked_stiffness, numeric
 from sympflow.hamiltonian.times import check_period, probe_times
-from sympflow.show.cards import Answering, Card, numbers
+from sympflow.show.cards import Answering, Card, brief, numbers
 
 if TYPE_CHECKING:
     import sympy
@@ -1028,7 +1028,7 @@ class HamiltonianSystem(Hamiltonian, Answering):
             "y0": "" if self.y0 is None else numbers(self.y0),
             "t_span": f"{self.t_span[0]:g} … {self.t_span[1]:g}",
             "dt": "" if self._dt is None else f"{self._dt:g}",
-            "domain": "" if self.domain is None else repr(self.domain),
+            "domain": "" if self.domain is None else brief(repr(self.domain)),
         }
         return Card(self.title, facts, formula=formula)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 import io
+import re
 import sys
 import unicodedata
 from abc import ABC, abstractmethod
@@ -137,6 +138,11 @@ def cut(text: str, longest: int = LONGEST) -> str:
     """A text in one line, cut at its end."""
     line = " ".join(text.split())
     return line if len(line) <= longest else f"{line[: longest - 2]} …"
+
+
+def brief(text: str) -> str:
+    """A text whose numbers have six digits at most."""
+    return re.sub(r"\d+\.\d{6,}(e[-+]?\d+)?", lambda found: f"{float(found[0]):.6g}", text)
 
 
 def numbers(values: Any, most: int = 8) -> str:
