@@ -439,7 +439,7 @@ def _too_fast(outcome: Outcome, integrator: FixedStep, problem: Problem) -> str:
     times, ends = [problem.t0, float(outcome.t[-1])], [to_numpy(y) for y in (problem.y0, outcome.y[-1])]
     rate = rate_of_motion(problem.system.between_impulses, times, ends)
     dt = integrator.step_length(problem.system)
-    if not _misses(integrator, np.array([dt * rate])).any():
+    if not rate or not _misses(integrator, np.array([dt * rate])).any():
         return ""
     most = float(PHASES[_misses(integrator, PHASES)][0])
     return (
@@ -451,7 +451,8 @@ def _too_fast(outcome: Outcome, integrator: FixedStep, problem: Problem) -> str:
 
 def _misses(integrator: FixedStep, z: np.ndarray) -> np.ndarray:
     """True for oscillations of z radians in a step that a method does not follow, (n,)."""
-    error = integrator.oscillation_error(z)
+    with np.errstate(all="ignore"):
+        error = integrator.oscillation_error(z)
     return (error > TOO_LONG) | ((error > 0) & (z >= PHASES[-1]))
 
 

@@ -243,8 +243,7 @@ class Splitting(FixedStep):
         multiplier = half_trace + np.where(np.sin(z) < 0, -root, root)
         # A step keeps an ellipse in (zq, hp), on which the energy, half the squared radius, changes.
         mean, half_change = (z * q[1] - p[0] / z) / 2, np.hypot(z * q[1] + p[0] / z, p[1] - q[0]) / 2
-        with np.errstate(divide="ignore", invalid="ignore"):
-            swing = np.where(mean > half_change, 2 * half_change / (mean - half_change), np.inf)
+        swing = np.where(mean > half_change, 2 * half_change / (mean - half_change), np.inf)
         return np.maximum(np.abs(multiplier - np.exp(1j * z)) / z, swing)
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
