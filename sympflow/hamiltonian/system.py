@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sympflow.arguments import advice, check_flag, check_positive, checked_count, floats, real_number, warn
-from sympflow.arrays import Array, differentiable, is_tensor, one_lane, to_numpy
+from sympflow.arrays import Array, learnable, one_lane, to_numpy
 from sympflow.hamiltonian.definition import bare_copy
 from sympflow.hamiltonian.domain import Domain, domain_of
 from sympflow.hamiltonian.fingerprint import fingerprint
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from sympflow.hamiltonian.lattice_states import LatticeStates
     from sympflow.hamiltonian.linear_part import LinearPart
     from sympflow.hamiltonian.local import LocalHamiltonian
-    from sympflow.hamiltonian.symbolic import Kick
+    from sympflow.hamiltonian.symbolic import Kick, SymbolicHamiltonian
 
 MOST_DEGREES = 1_000_000
 TYPESET = 400  # characters of an H that notebooks typeset
@@ -136,7 +136,7 @@ class Scene:
         try:
             state = floats("y0", self.y0)
         except OverflowError:
-            raise ValueError("`y0` must be finite: it has an integer that no float is near.") from None
+            raise ValueError("`y0` must be finite: it has an integer too large for a float.") from None
         if state.shape != (2 * ndof,):
             raise ValueError(f"`y0` must have shape ({2 * ndof},), [q, p]; got {state.shape}.")
         return state
@@ -205,8 +205,8 @@ class HamiltonianSystem(Hamiltonian, Answering):
         The period in t of H, of a driven system; other values than its own are a ValueError. Sections and multipliers
         take it.
     damping : float or array_like of shape (d,) or (d, d), optional
-        Γ: one rate, one for each p, or a symmetric positive semi-definite matrix; 0 is none. The splitting methods on
-        the splitting "kinetic" and the Runge–Kutta methods solve it; all else refuses it, with the reason.
+        Γ: one rate, one for each p, or a symmetric positive semi-definite matrix; 0 for none. Splitting
+        methods on the splitting "kinetic" and the Runge–Kutta methods solve it; all else refuses it, with the reason.
     name : str
     domain : Domain, optional
         Ω, where flows are trained. Classical methods never need one.
@@ -305,7 +305,7 @@ class HamiltonianSystem(Hamiltonian, Answering):
             if value is not None and not definition.separable:
                 raise TypeError(f"`{argument}` only goes with `potential`: leave it out, it is part of `hamiltonian`.")
         M: Any = mass
-        followed = M if is_tensor(M) and (M.requires_grad or differentiable(M)) else None
+        followed = M if learnable(M) else None
         M = M if followed is None else to_numpy(M)
         inverse_mass, quadratic = checked_inverse_mass(M, d) if definition.separable else None, definition.separable
         K = None if stiffness_matrix is None else checked_stiffness(stiffness_matrix, d)
@@ -375,9 +375,20 @@ class HamiltonianSystem(Hamiltonian, Answering):
                 "times as long as by HamiltonianSystem.lattice, from one site and one bond, or by "
                 "HamiltonianSystem.pairs, from one pair. Use one of these."
             )
+        return cls._of_symbols(symbols, params, settled, damping, period)
+
+    @classmethod
+    def _of_symbols(
+        cls,
+        symbols: SymbolicHamiltonian,
+        params: Mapping[str, Any],
+        scene: Scene,
+        damping: float | ArrayLike | None,
+        period: float | None = None,
+    ) -> HamiltonianSystem:
         self = cls.__new__(cls)
         M = symbols.inverse_mass
-        self._make(symbols, None if M is None else numeric(M), M is not None, params, settled, damping, period)
+        self._make(symbols, None if M is None else numeric(M), M is not None, params, scene, damping, period)
         return self
 
     @classmethod
@@ -838,7 +849,7 @@ class HamiltonianSystem(Hamiltonian, Answering):
 
     @property
     def params(self) -> Mapping[str, float]:
-        """The values of the parameters, read-only: they are part of H, from which all code is generated.
+        """The values of the parameters, read-only, because code is generated from them.
 
         A system with others is made by `HamiltonianSystem.from_sympy`, or by the function of its scene.
         """
@@ -854,7 +865,7 @@ class HamiltonianSystem(Hamiltonian, Answering):
             return
         if self.symbols is None:
             raise TypeError(
-                f"`params` are of symbolic systems, and {self.name!r} is given by functions, which hold their values: "
+                f"`params` are for symbolic systems, and {self.name!r} is given by functions, which hold their values: "
                 "make a system for each, or define it with HamiltonianSystem.from_sympy(..., params=...)."
             )
         if self.external_force is not None:
@@ -867,7 +878,7 @@ class HamiltonianSystem(Hamiltonian, Answering):
                 has = f"which has {', '.join(known)}" if known else "which has none: write H with symbols for them"
                 if name == "damping" and self.damping is not None:
                     has += "; `damping` is not one: make a system for each value"
-                raise ValueError(f"`params` has {name!r}, no parameter of {self.name!r}, {has}.")
+                raise ValueError(f"`params` has {name!r}, which is not a parameter of {self.name!r}, {has}.")
 
     def with_params(self, **values: float) -> HamiltonianSystem:
         """The same system with other values of some parameters. Most methods reuse the compiled code.
@@ -893,9 +904,15 @@ class HamiltonianSystem(Hamiltonian, Answering):
         """
         if self.local is not None:
             return HamiltonianSystem._of_local(self.local.with_params(values), self.damping, self.scene)
+        from sympflow.hamiltonian.symbolic import checked_params
+
         self.check_parameters(values)
         H, time = self.symbols.written[0], self.symbols.named_time
         params = {**self.params, **values}
+        checked = checked_params(params)
+        symbols = self.symbols.revalued(checked)
+        if symbols is not None:
+            return HamiltonianSystem._of_symbols(symbols, checked, self.scene, self.damping)
         made = HamiltonianSystem.from_sympy(H, params=params, time=time, damping=self.damping, **vars(self.scene))
         # Values of the drive may have changed the period: it is tested where it is asked for.
         made._former_period = self.period or self._former_period
@@ -991,7 +1008,7 @@ class HamiltonianSystem(Hamiltonian, Answering):
 
     @cached_property
     def fingerprint(self) -> tuple[float, ...]:
-        """H at 8 fixed states less H at a ninth, then Γ: what tells a trained flow whether this is its system."""
+        """H at 8 fixed states less H at a ninth, then Γ: a trained flow recognises its system by them."""
         return fingerprint(self)
 
     def __repr__(self) -> str:
@@ -1068,7 +1085,7 @@ COUNTED = {
 
 
 class counting_view:
-    """A view of a system that tells `count` of each evaluation of a force or a derivative of it, not of inner ones."""
+    """A view of a system that calls `count` for each evaluation of a force or a derivative of it, except inner ones."""
 
     def __init__(self, system: HamiltonianSystem, count: Callable[[str, Array], None]) -> None:
         self._system, self._count = system, count
