@@ -143,7 +143,7 @@ def to_numpy(x: Array) -> np.ndarray:
 
 def learnable(*arrays: Any) -> bool:
     """Return True if torch could follow one of these tensors, were gradients enabled."""
-    return any(is_tensor(x) and (x.requires_grad or _is_transformed(x)) for x in arrays)
+    return any(x.requires_grad or _is_transformed(x) for x in filter(is_tensor, arrays))
 
 
 def differentiable(*arrays: Any) -> bool:
@@ -250,7 +250,7 @@ def _behind(x: Any) -> tuple[Any, Sequence[int]]:
 
 def transformed(*arrays: Any) -> bool:
     """Return True if torch follows one of these tensors by other means than a graph for reverse mode."""
-    return any(is_tensor(x) and _is_transformed(x) for x in arrays)
+    return any(map(_is_transformed, filter(is_tensor, arrays)))
 
 
 def _keeps_graphs() -> bool:

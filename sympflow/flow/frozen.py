@@ -186,7 +186,7 @@ class FrozenNetwork(KnownFlow):
 
     @classmethod
     def of_file(cls, path: Path, system: HamiltonianSystem) -> Self | None:
-        """Read a flow that ships, of that system; None if it is none of networks."""
+        """Read a flow that ships, of that system; None unless it is a flow of networks."""
         from sympflow.kernels.networks import NetworkLayer
 
         record, arrays = _read(path)

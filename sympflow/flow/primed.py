@@ -301,7 +301,7 @@ class PrimedFlow(PrimedKnown, SystemFlow):
         return other
 
     def force_gradient_coefficients(self) -> np.ndarray:
-        """−½|∇V|²_{M⁻¹} by the monomials of the kicks (M,); 0 where it is no such polynomial."""
+        """−½|∇V|²_{M⁻¹} by the monomials of the kicks (M,); 0 where it is not such a polynomial."""
         system = self.system
         assert system is not None
         assert system.symbols is not None

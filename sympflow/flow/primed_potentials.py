@@ -39,8 +39,8 @@ def _called(f: Callable[..., Array], system: HamiltonianSystem, q: Tensor, t: Te
         return f(q, t)
     if q.requires_grad:
         raise TypeError(
-            f"`system` {system.name!r} has functions of NumPy arrays, through which no gradient flows: write them for "
-            "tensors too, or use HamiltonianSystem.from_sympy."
+            f"`system` {system.name!r} has functions of NumPy arrays, and gradients do not flow through these: write "
+            "them for tensors too, or use HamiltonianSystem.from_sympy."
         )
     times = None if t is None else t.cpu().numpy()
     return torch.as_tensor(f(q.cpu().numpy(), times), dtype=q.dtype, device=q.device)

@@ -94,7 +94,7 @@ class CallableHamiltonian(Definition):
 
     @np.errstate(all="ignore")
     def as_sum(self) -> tuple[CallableHamiltonian, np.ndarray | None, bool] | None:
-        """The definition of H = T(p) + V(q) by V, M⁻¹, and whether T = ½ pᵀM⁻¹p; None of an H that is no such sum."""
+        """The definition of H = T(p) + V(q) by V, M⁻¹, and whether T = ½ pᵀM⁻¹p; None for any other H."""
         form, d = self.form, self.ndof
         if form is None or self.separable:
             return None
@@ -211,7 +211,7 @@ class CallableHamiltonian(Definition):
         if not np.isfinite(values).any():
             raise Untraceable("it is not finite at the states at which it was tried: give `y0`")
         if not _alike(form.value(x, *at), values):
-            raise Untraceable("the values of what was traced are others: it depends on more than its arguments")
+            raise Untraceable("what was traced has other values: the function depends on more than its arguments")
         self._compare_given(form, x, times)
         i = int(np.nanargmax(np.where(np.isfinite(values), np.abs(values), np.nan)))
         self._known = states[i], times[i], float(values[i])

@@ -15,6 +15,9 @@ from sympflow.arrays import Array
 if TYPE_CHECKING:
     from sympflow.hamiltonian.poles import Places
 
+ASIDE = 64 * float(np.finfo(float).eps)
+"""Share of the times between which a run goes on from a jump, or ends before it, so that H is that of one side."""
+
 
 def bare_copy(x: Any) -> Any:
     """Return a copy of an object without what was found out of it, its cached properties."""

@@ -158,7 +158,7 @@ def doubled(
         F = SymbolicForce(system, [0] * system.ndof if force is None else force, params)
         if system.conservative and F.has_potential:
             warn(
-                "`force` is that of a potential, which keeps an energy: put it into H, and solve that system.",
+                "`force` derives from a potential, so that an energy is kept: put it into H, and solve that system.",
                 UserWarning,
             )
         time = None if system.symbols.time is None else {"time": system.symbols.time, "period": system.period}

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 MOST_IN_SYMBOLS = 300  # operations
 MOST_COMPILED = 5000  # operations of a gradient
 _JUMPING = {"sign", "floor", "mod", "where", "lt", "le", "eq", "atan2"}
-_BENDING = {"abs", "min", "max", "asin", "acos"}
+_BENDING = {"abs", "min", "max", "asin", "acos", "acosh", "sqrt", "pow"}
 _OF_FIRST = "pow log log1p tan sqrt acos asin acosh atanh gamma lgamma digamma ellipk bose csch"
 _SINGULAR = {"div": 1} | dict.fromkeys(_OF_FIRST.split(), 0)
 """The argument by which an operation is infinite or no number."""

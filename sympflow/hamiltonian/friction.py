@@ -1,4 +1,4 @@
-"""Friction p' = −Γp, alone and with the drift q' = M⁻¹p: linear fields, of which the flows are exact."""
+"""Friction p' = −Γp, alone and with the drift q' = M⁻¹p: linear fields with exact flows."""
 
 from __future__ import annotations
 

@@ -209,9 +209,9 @@ class Hamiltonian:
         return forced
 
     def as_doubled(self) -> Any:
-        """Return the system itself if it is a doubled one; a ValueError if it is none."""
+        """Return the system itself if it is doubled; a ValueError otherwise."""
         raise ValueError(
-            f"`system` {self.called} is not doubled: its states are the physical ones: make one "
+            f"`system` {self.called} is not doubled, so that its states are the physical ones: make one "
             "by sympflow.doubled(system, force), or leave out what asks for its physical limit."
         )
 
@@ -225,7 +225,7 @@ class Hamiltonian:
         )
 
     def identity_parts(self) -> Any:
-        """Return all that H and the equations of motion are made of, by which a store knows the system again."""
+        """Return all that H and the equations of motion are made of; a store recognises the system by it."""
         return [
             self.definition,
             self.inverse_mass,
@@ -551,7 +551,7 @@ class Hamiltonian:
 
     @property
     def few_sites(self) -> Self:
-        """A few of the sites of a lattice, by which a flow for any size knows it; else the system itself."""
+        """A lattice of a few sites, by which a flow for any size recognises it; else the system itself."""
         return self
 
     @property

@@ -18,6 +18,7 @@ MOST_SHOWN = 100  # characters of terms
 DIGITS, HALVINGS = 50, 100  # of the arithmetic in which H is judged beside such a place, and of the way to it
 BESIDE = 1e-3, 1e-6, 1e-9
 """Distances from a place, in parts of a step, at which H is compared: of a finite one the differences decrease."""
+AIMED = 1e-12  # share of the square of a distance below which that of the closest approach is 0
 MOST_MET = 16  # pairs that changed their cells in a step, which are looked at
 DECREASES = 0.7  # by less, of the second difference to the first, where H is infinite: by 1 of a logarithm
 
@@ -95,6 +96,10 @@ class Poles(Places, Protocol):
     def exact(self) -> Poles | None:
         return self
 
+    def ahead(self, y: np.ndarray) -> np.ndarray:
+        """True (N,) for states (N, 2d) from which a free flight meets a place, or may."""
+        return np.ones(len(y), dtype=bool)
+
     def passed(self, column: int, t: Sequence[float], y: np.ndarray) -> bool:
         """Return True if H is infinite or not a number on the way between states y (2, 2d) in two cells."""
 
@@ -120,7 +125,9 @@ class SymbolicPoles(Poles):
         T = symbols.T if symbols.separable else sp.Add(*[sp.Abs(s * sp.diff(symbols.H, s)) for s in letters])
         cells = [sp.S.Zero if place.g.is_nonnegative else place.cell for place, _ in self._places]
         self._look = symbols.evaluated("cells", [*cells, symbols.H, T])
-        self._sizes = symbols.evaluated("sizes", [place.g for place, _ in self._places])
+        states = {*symbols.q, *symbols.p}  # a place in t alone is crossed, or met by none of the steps
+        sizes = [place.g if place.g.free_symbols & states else sp.S.One for place, _ in self._places]
+        self._sizes = symbols.evaluated("sizes", sizes)
 
     def look(self, y: np.ndarray, t: Any, numbers: Sequence[Any] = ()) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         values = self._look(y, *self._time(y, t), numbers=numbers)
@@ -128,6 +135,17 @@ class SymbolicPoles(Poles):
 
     def sizes(self, y: np.ndarray, t: Any) -> np.ndarray:
         return self._sizes(y, *self._time(y, t))
+
+    def ahead(self, y: np.ndarray) -> np.ndarray:
+        if not all(place.g.is_nonnegative for place, _ in self._places):
+            return super().ahead(y)
+        q, v = y[:, : self._symbols.ndof], self._symbols.gradient(y)[:, self._symbols.ndof :]
+        duration = np.abs(q).max(1, keepdims=True) / np.maximum(np.abs(v).max(1, keepdims=True), 1e-300)
+        on_the_way = [np.concatenate([q + s * duration * v, y[:, self._symbols.ndof :]], axis=1) for s in (-1, 0, 1)]
+        before, now, after = (self.sizes(x, 0.0) for x in on_the_way)
+        slope, bend = (after - before) / 2, (after + before) / 2 - now  # of a square of a distance
+        least = now * bend - slope**2 / 4
+        return ((bend > 0) & (np.abs(least) <= AIMED * np.abs(now * bend))).any(-1)
 
     def passed(self, column: int, t: Sequence[float], y: np.ndarray) -> bool:
         place, f = self._places[column]
@@ -242,6 +260,9 @@ class PairsPoles(Poles):
 
     def may_pass(self, y: np.ndarray) -> bool:
         return not self._only_meet or self._pairs.may_pass(y)
+
+    def ahead(self, y: np.ndarray) -> np.ndarray:
+        return np.array([self.may_pass(state) for state in y])
 
     def look(self, y: np.ndarray, t: Any, numbers: Sequence[Any] = ()) -> tuple[np.ndarray, np.ndarray, None]:
         q, end = y[..., : self._pairs.ndof], self._pairs.cutoff

@@ -124,7 +124,7 @@ def check_recorded(f: sp.Expr) -> None:
     """Raise a ValueError with the term of an expression of which `calculated` has no rule for a function."""
     for term in sp.Add.make_args(f):
         if not can_be_recorded(term):
-            raise arrays_only(f"`system` has the term {term}, for which there is no compiled function")
+            raise arrays_only(f"`system` has the term {term}, and there is no compiled function for it")
 
 
 def calculated(f: sp.Basic, value: Callable[[sp.Basic], Any]) -> Any:

@@ -43,12 +43,14 @@ from sympflow.hamiltonian.jumps import (
     MOST_POINTS,
     Impulse,
     Switch,
+    Touch,
     Zeros,
     borders,
     check_continuous,
     has_period,
     refuse_deltas,
     split_impulses,
+    touches,
 )
 from sympflow.hamiltonian.poles import Poles, SymbolicPoles
 from sympflow.hamiltonian.recorded import recorded
@@ -135,7 +137,7 @@ class SymbolicHamiltonian(Definition):
             raise ValueError("`expression` must depend on q1 … qd and p1 … pd (or q and p).")
         if ndof - len(used) > MOST_LEFT_OUT:
             raise ValueError(
-                f"`expression` has coordinates of the number {str(ndof)[:20]}, and depends on {len(used)} degrees of "
+                f"`expression` has coordinates numbered up to {str(ndof)[:20]}, and depends on {len(used)} degrees of "
                 "freedom: number them from 1, q1 … qd and p1 … pd."
             )
         if ndof > MOST_COORDINATES:
@@ -264,12 +266,13 @@ class SymbolicHamiltonian(Definition):
         return bool(self.samples or self._switches)
 
     @cached_property
-    def _switches(self) -> list[Switch]:
-        """Borders at which H may jump in t alone."""
+    def _switches(self) -> list[Switch | Touch]:
+        """Places at which H may jump, or have a kink, in t alone."""
         if self.time is None:
             return []
         own = [border for border in borders(self.H, [self.time], kinks=True) if border.g.free_symbols == {self.time}]
-        return [Switch(border, self.time, self.samples) for border in own]
+        jumping = [Switch(border, self.time, self.samples) for border in own]
+        return [*jumping, *touches(self.H, self.time, self.samples)]
 
     def jump_times(self, low: float, high: float, step: float, kinks: bool = False) -> np.ndarray:
         found = [samples.jump_times(low, high) for samples in self.samples.values()]
@@ -604,7 +607,7 @@ def _check_values(H: sp.Expr, values: Mapping[sp.Symbol, sp.Expr]) -> None:
     numbers = [abs(a) for a in H.atoms(sp.Number)]
     if H.has(sp.zoo, sp.nan, sp.oo) or complex_part(H) is not None or any(a > LARGEST for a in numbers):
         shown = ", ".join(f"{s} = {float(value):.9g}" for s, value in values.items() if value.is_number)
-        raise ValueError(f"`params` has {shown}, with which the expression is not a finite real one: change them.")
+        raise ValueError(f"`params` has {shown}, but then the expression is not a finite real one: change them.")
 
 
 def _check_samples(written: sp.Expr, values: Mapping[sp.Symbol, sp.Expr]) -> None:
@@ -614,8 +617,8 @@ def _check_samples(written: sp.Expr, values: Mapping[sp.Symbol, sp.Expr]) -> Non
         if isinstance(value, sampled) and all(term.free_symbols <= values.keys() for term in terms if term.has(symbol)):
             raise ValueError(
                 f"`params` has {symbol.name}, a spline, which is a function of the time: in a term without q and p it "
-                "moves nothing. Give a potential by functions, HamiltonianSystem(V, ndof=…, gradient=…); where it is "
-                "the time that is meant, pass time='t'."
+                "moves nothing. Give a potential by a function, HamiltonianSystem(lambda q: V(q[..., 0]), ndof=1); "
+                "where it is the time that is meant, pass time='t'."
             )
 
 
@@ -874,8 +877,8 @@ def _modules(library: str, code: list[sp.Expr]) -> list[Any]:
         return [own | _special_functions(), "scipy", np] if special else [own, np]  # by its name SymPy loads all of it
     if special:
         raise TypeError(
-            f"`expression` holds {', '.join(special)}, which torch has not: solve on NumPy states, with a method that "
-            "does not need tensors."
+            f"`expression` holds {', '.join(special)}, which torch does not have: solve on NumPy states, with a method "
+            "that does not need tensors."
         )
     import torch
 

@@ -155,8 +155,8 @@ class KineticPotential(Composition):
             )
         if (scheme.nystrom or scheme.level) and not system.quadratic_kinetic:
             raise ValueError(
-                f"`method` {method!r} needs a kinetic energy ½ pᵀM⁻¹p, which {system.called} has not: use a scheme "
-                "for any separable system, such as 'kahan_li8'."
+                f"`method` {method!r} needs a kinetic energy ½ pᵀM⁻¹p, which {system.called} does not have: use a "
+                "scheme for any separable system, such as 'kahan_li8'."
             )
         system.check_damped_drifts()
 

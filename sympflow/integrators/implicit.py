@@ -16,7 +16,8 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.times import stage_time
 from sympflow.integrators.base import FixedStep
 from sympflow.integrators.contract import Failure, Problem, method_class
-from sympflow.integrators.steppers import ArraySteps, Stepper, stepper_of
+from sympflow.integrators.loops import stepper_of
+from sympflow.integrators.steppers import ArraySteps, Stepper
 
 _BUTCHER = "J. C. Butcher, Implicit Runge–Kutta processes, Math. Comp. 18 (1964) 50–64"
 _SYMPLECTIC = (

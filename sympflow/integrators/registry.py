@@ -169,7 +169,7 @@ def register(name: str, integrator: type[Integrator] | Scheme) -> None:
         raise TypeError(f"`integrator` {integrator.__name__} has no `name`: set that class attribute.")
     if name in _plugins():
         raise ValueError(
-            f"`name` {name!r} is that of the plug-in {distribution(_plugins()[name])}, which would be replaced: "
+            f"`name` {name!r} belongs to the plug-in {distribution(_plugins()[name])}, which would be replaced: "
             "choose another name."
         )
     if scheme is not None:
@@ -293,8 +293,8 @@ class naming_plugin:
 def check_applies(integrator: Integrator, system: HamiltonianSystem, y0: Array | None = None) -> None:
     """`integrator.check(system)`: a ValueError says that the method does not apply; a plug-in that fails is named.
 
-    The functions of a user's system are tested too, for states such as y0. Friction, forces that are none of H, and H
-    that depends on t are refused here for every method that does not say that it takes them.
+    The functions of a user's system are tested too, for states such as y0. Friction, forces that do not come from H,
+    and an H that depends on t are refused here for every method that does not declare that it takes them.
     """
     system.check_impulses(
         "which are kicks between the steps of a method",

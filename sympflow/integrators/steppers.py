@@ -14,14 +14,12 @@ from sympflow.arrays import (
     differentiable,
     finite_states,
     full_of_nan,
-    is_tensor,
     library_name,
     like,
     stack,
     transformed,
     with_rows,
 )
-from sympflow.compiler import NotCompiled
 from sympflow.integrators.contract import Problem
 from sympflow.integrators.grid import Grid
 from sympflow.kernels.protocol import RunCheckpoint
@@ -113,10 +111,6 @@ class Stepper:
         """
         if self.kernel is None:
             return self.arrays.rollout(y0, h, n_steps, save, t0, carry)
-        if is_tensor(y0):
-            from sympflow.integrators.tensors import rolled_out
-
-            return rolled_out(self, y0, h, n_steps, save, t0, carry)
         rows = y0 if y0.ndim == 1 else y0.reshape(-1, y0.shape[-1])
         states, last, iterations = self.kernel.run(h, rows, n_steps, save, carry, t0)
         self.remark = self.kernel.remark
@@ -129,10 +123,6 @@ class Stepper:
         """Return the states a step of length h, a number or one for each state, after y (..., 2d) at the time t."""
         if self.kernel is None:
             return self.arrays.step(y, h, t)
-        if is_tensor(y):
-            from sympflow.integrators.tensors import stepped
-
-            return stepped(self, y, h, t)
         self.arrays.check_lengths(h)
         times = t if np.ndim(t) == 0 else np.broadcast_to(t, y.shape[:-1]).reshape(-1)
         rows = y if y.ndim == 2 else np.ascontiguousarray(y).reshape(-1, y.shape[-1])
@@ -148,87 +138,6 @@ class Stepper:
             return dict.fromkeys(("force_evaluations", "hessian_evaluations"), arrays.iterations * arrays.stages)
         known = arrays.counts if self.kernel is None else self.kernel.evaluations(n_steps, n_saved, n_extra)
         return arrays.evaluations(n_steps, n_saved, n_extra, self.backend) if known is None else dict(known)
-
-
-def stepper_of(
-    integrator: Any, problem: Problem, arrays: ArraySteps, make: Callable[..., Any], compensated: bool = False
-) -> Stepper:
-    """Return the stepper of the loops that `make` gives, for names of parameters where gradients flow to these."""
-    if problem.followed:
-        return Stepper(integrator, problem, arrays, _followed_loops(make, problem))
-    told: list[str] = []
-    kernel = compiled_loops(make, problem.y0, problem.backend, compensated, told, problem.system)
-    if problem.parameter_values is not None:
-        kernel = kernel.varied(problem.parameter_values)
-    return Stepper(integrator, problem, arrays, kernel, told)
-
-
-def compiled_loops(
-    make: Callable[[], Any],
-    y0: Array,
-    backend: str,
-    compensated: bool = False,
-    told: list[str] | None = None,
-    system: Any = None,
-) -> Any:
-    """Return the compiled loops that `make` gives, or None where the call needs, or asks for, array operations.
-
-    Tensors need these, except on the CPU where the `system` is given.
-    """
-    reason, tensor = None, is_tensor(y0)
-    if backend == "array":
-        reason = "`backend` is 'array': choose 'auto'."
-    elif tensor:
-        reason = _no_loops_for(y0, system)
-    elif y0.dtype != np.float64:
-        reason = f"`y0` is {y0.dtype}: use float64, or backend='array'."
-    asked = reason is None
-    if reason is None:
-        try:
-            loops = make()
-            if tensor and differentiable(y0):
-                loops.check_reverse()
-            return loops
-        except NotCompiled as error:
-            reason = str(error)
-    if backend == "compiled":
-        raise ValueError(f"`backend` {backend!r} does not apply. {reason}") from None
-    if compensated:
-        needed = "" if reason.startswith("`compensated`") else "`compensated` sums need compiled loops. "
-        raise ValueError(needed + reason) from None
-    if told is not None and backend == "auto" and asked:
-        told.append(reason)
-    return None
-
-
-def _followed_loops(make: Callable[[tuple[str, ...]], Any], problem: Problem) -> Any:
-    """The compiled loops, that `make` gives for names, of a run through which gradients flow to parameters."""
-    names, array = tuple(problem.followed), problem.backend == "array"
-    try:
-        if reason := "`backend` is 'array'." if array else _no_loops_for(problem.y0, problem.system):
-            raise NotCompiled(reason)
-        if problem.system.symbols is None:
-            raise NotCompiled(f"`system` {problem.system.name!r} is not symbolic.")
-        loops = make(names)
-        loops.check_reverse()
-        return loops.varied(problem.parameter_values)
-    except NotCompiled as error:
-        raise ValueError(
-            f"`params` has {', '.join(names)}, to which no gradient flows: {error} Detach them."
-        ) from error
-
-
-def _no_loops_for(y0: Array, system: Any) -> str | None:
-    """Why a tensor needs array operations, if it does."""
-    if system is None:
-        return "`y0` is a tensor: pass a NumPy array, or use backend='array'."
-    if y0.device.type != "cpu":
-        return f"`y0` is on {y0.device}: move it to the CPU, or use backend='array'."
-    if transformed(y0):
-        return "`y0` is followed by torch.func, forward mode or torch.compile: use backend='array'."
-    if system.layered is None and system.learns(y0):
-        return "`system` has numbers that torch follows: use backend='array'."
-    return None
 
 
 def rollout(

@@ -40,11 +40,6 @@ def test_events_and_dense_output_are_of_the_mean_of_the_copies(system):
     np.testing.assert_allclose(sol.sol(sol.t), sol.y, rtol=0, atol=1e-14)
 
 
-def test_copies_that_drift_apart_are_told(system):
-    with pytest.warns(RuntimeWarning, match="two copies that method 'tao4' keeps differ by up to .* change `omega`"):
-        sympflow.solve(system, "tao4", (0, 100), dt=0.05, omega=0.5)
-
-
 def test_lanes_of_vmap_run_as_they_do_alone_and_are_told_likewise(system):
     lanes = torch.tensor(system.y0) * torch.linspace(0.7, 1.3, 3, dtype=torch.float64)[:, None]
 

@@ -81,12 +81,6 @@ def test_functions_of_the_time():
     np.testing.assert_allclose(solve(stiff, "impulse").y, solve(symbols, "impulse", **arrays).y, rtol=0, atol=1e-12)
 
 
-def test_the_energy_balance_is_that_of_the_steps():
-    runs = [solve(LINEAR, "linear_srkn6b", dt=dt, backend="array") for dt in (0.05, 0.025)]
-    errors = [sympflow.energy_balance_error(sol).max() for sol in runs]
-    assert errors[0] / errors[1] > 2**3.5
-
-
 @pytest.mark.parametrize(
     ("ask", "message"),
     [

@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy.interpolate import CubicSpline
 
-from sympflow import Box, HamiltonianSystem, get, solve, systems
+from sympflow import Box, HamiltonianSystem, get, solve
 from sympflow.kernels import reverse
 
 CUBIC = HamiltonianSystem.from_sympy(
@@ -102,23 +102,6 @@ def test_gradients_by_parameters(system, method, params, run):
     for name, gradient in zip(params, torch.autograd.grad(weighted(sol), list(tensors.values())), strict=True):
         difference = (value(**{name: params[name] + h}) - value(**{name: params[name] - h})) / (2 * h)
         np.testing.assert_allclose(float(gradient.sum()), difference, rtol=1e-6, atol=1e-7)
-
-
-@pytest.mark.parametrize(
-    ("system", "method", "options"),
-    [
-        (GEODESIC, "gauss_legendre4", {"dt": 0.1}),
-        (DRIVEN, "implicit_midpoint", {"dt": 0.1}),
-        (GEODESIC, "tao4", {"dt": 0.1, "omega": 2.0}),
-        (systems.henon_heiles(), "sympflow", {}),
-    ],
-)
-def test_tensors_without_gradients_run_compiled(system, method, options):
-    y0, run = start(system, (3,)), {"t_span": (0, 2), "t_eval": [1.03, 2.0], **options}
-    sol = solve(system, method, y0=torch.tensor(y0), **run)
-    assert sol.stats["backend"] == "compiled"
-    np.testing.assert_array_equal(sol.y.numpy(), solve(system, method, y0=y0, **run).y)
-    assert solve(system, method, y0=torch.tensor(y0, requires_grad=True), **run).y.requires_grad
 
 
 def test_first_and_second_derivatives():

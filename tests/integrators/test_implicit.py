@@ -129,17 +129,3 @@ def test_compensated_sums_need_compiled_loops_and_lower_the_rounding():
     assert rms[1] < 0.5 * rms[0]
     with pytest.raises(ValueError, match=r"^`compensated` sums need compiled loops"):
         solve(pendulum, "gauss_legendre4", (0.0, 1.0), compensated=True, backend="array")
-
-
-def test_functions_that_cannot_be_traced_run_with_arrays():
-    def H(q, p):
-        return ((p**2 + 1) * (q**2 + 1)).sum(-1) / 2 if (q < 10).all() else p.sum(-1)
-
-    system = HamiltonianSystem(hamiltonian=H, ndof=1)
-    sol = solve(system, "gauss_legendre4", (0.0, 2.0), y0=PRODUCT.y0, dt=PRODUCT.dt)
-    assert sol.stats["backend"].startswith("numpy: `hamiltonian` could not be traced, for it branches on a value")
-    assert "write np.where" in repr(system)
-    reference = solve(PRODUCT, "gauss_legendre4", (0.0, 2.0))
-    np.testing.assert_allclose(sol.y, reference.y, rtol=0, atol=1e-13)
-    with pytest.raises(ValueError, match=r"^`backend` 'compiled' does not apply"):
-        solve(system, "gauss_legendre4", (0.0, 2.0), y0=PRODUCT.y0, backend="compiled")

@@ -122,15 +122,6 @@ def test_a_reference_of_another_problem_is_refused():
     assert report.to_dict()["reference"] == {"method": "given", "accuracy": None}
 
 
-def test_a_solution_may_be_the_reference():
-    system, t = systems.pendulum(), np.arange(1, 51) / 5
-    truth = solve(system, "kahan_li8", (0, 10), t_eval=t)
-    report = compare(system, ["verlet"], ["error"], t_span=(0, 10), reference=truth, **QUICK)
-    verlet = solve(system, "verlet", (0, 10), t_eval=t)
-    assert report.rows[0].error == reference_error(verlet, truth).max()
-    assert report.reference.method == "given"
-
-
 def test_a_batch_is_summed_up_by_its_median_and_its_worst():
     system = systems.henon_heiles()
     y0 = system.domain.sample(5, 0)
