@@ -290,16 +290,15 @@ class CallableHamiltonian(Definition):
                 f"the state {state[:8]}: it reads something that has changed since. Make a new HamiltonianSystem."
             )
 
-    def _exact(self, x: Array) -> TracedHamiltonian | None:
-        """The program, where it gives derivatives for x: torch differentiates functions of its own tensors itself."""
-        form = self.form
-        if form is None or (is_tensor(x) and self._follows_tensors):
+    def _exact(self, x: Array, function: Any = None) -> TracedHamiltonian | None:
+        """The program, where it is taken at x: in place of a user's function, if one is given, for tensors only.
+
+        Torch differentiates functions of its own tensors itself.
+        """
+        form, tensor = self.form, is_tensor(x)
+        if form is None or (tensor and self._follows_tensors) or not (tensor or function is None):
             return None
         return form if self.library == "numpy" or form.size <= MOST_BY_ARRAYS else None
-
-    def _in_place_of(self, function: Any, x: Array) -> TracedHamiltonian | None:
-        """The program in place of a user's function: where that was not given, or takes no tensors such as x."""
-        return self._exact(x) if function is None or is_tensor(x) else None
 
     @cached_property
     def _follows_tensors(self) -> bool:
@@ -398,7 +397,7 @@ class CallableHamiltonian(Definition):
 
     def hamiltonian(self, x: Array, *t: Any) -> Array:
         """V of q or H of y, by the function itself, but for tensors that it does not take."""
-        if (form := self._in_place_of(self._own, x)) is not None:
+        if (form := self._exact(x, self._own)) is not None:
             return form.value(x, *t)
         _ = self.form  # finds out for which library the function is written
         if self._gradient is not None or self.library == library_name(x) == "numpy":
@@ -406,7 +405,7 @@ class CallableHamiltonian(Definition):
         return _with_torch(partial(self._own, *t), x, self._name, (), self._reason)
 
     def gradient(self, x: Array, *t: Any) -> Array:
-        if self._gradient is None or self._in_place_of(self._gradient, x) is not None:
+        if self._gradient is None or self._exact(x, self._gradient) is not None:
             return self._derived("gradient", _gradient_of, x, x.shape[-1:], t)
         return _checked(self._protected(self._gradient, "gradient", t, x), x, "gradient", x.shape[-1:])
 
@@ -459,7 +458,7 @@ class CallableHamiltonian(Definition):
             raise ValueError(f"{refused}, q.copy() ({error}).") from error
 
     def hessian_vector(self, q: Array, v: Array, *t: Any) -> Array:
-        if (form := self._in_place_of(self._hessian_vector, q)) is not None:
+        if (form := self._exact(q, self._hessian_vector)) is not None:
             return form.hessian_vector(q, v, *t)
         if self._hessian_vector is None:
             return super().hessian_vector(q, v, *t)

@@ -57,30 +57,6 @@ def test_a_step_that_is_overridden_is_counted_anew():
     assert solve(HH, Twice(dt=0.1), (0, 1)).nfev == 40
 
 
-def test_all_functions_of_the_system_are_counted_and_no_inner_call_twice():
-    counts: dict[str, int] = {}
-
-    def count(what, x):
-        counts[what] = counts.get(what, 0) + 1
-
-    view = counting_view(HH, count)
-    y = HH.y0
-    for value, expected in (
-        (view.force(y[:2]), HH.force(y[:2])),
-        (view.gradient(y), HH.gradient(y)),
-        (view.vector_field(y), HH.vector_field(y)),
-        (view(0.0, y), HH(0.0, y)),
-        (view.hessian(y), HH.hessian(y)),
-        (view.potential_hessian(y[:2]), HH.potential_hessian(y[:2])),
-        (view.hessian_vector(y[:2], y[2:]), HH.hessian_vector(y[:2], y[2:])),
-        (view.curvature_gradient(y[:2]), HH.curvature_gradient(y[:2])),
-    ):
-        np.testing.assert_array_equal(value, expected)
-    assert counts == {"force_evaluations": 4, "hessian_evaluations": 3, "curvature_evaluations": 1}
-    counting_view(NONSEPARABLE, count).vector_field(NONSEPARABLE.y0)
-    assert counts["force_evaluations"] == 5
-
-
 def test_a_view_passes_for_its_system():
     view = counting_view(HH, lambda what, x: None)
     assert isinstance(view, type(HH))

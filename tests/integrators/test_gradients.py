@@ -408,8 +408,19 @@ def verlet_by_hand(y, mass, n_steps, dt):
     return torch.cat([q, p])
 
 
-@pytest.mark.parametrize("mass", [1.7, [1.7, 0.6], [[1.7, 0.3], [0.3, 0.9]]], ids=["one", "each", "matrix"])
-def test_gradients_flow_to_masses(mass):
+OF_MASSES = ("kahan_li8", "srkn11b", "takahashi_imada", "gauss_legendre6", "rk4")
+MASSES = {"one": 1.7, "each": [1.7, 0.6], "matrix": [[1.7, 0.3], [0.3, 0.9]]}
+
+
+@pytest.mark.parametrize(
+    ("mass", "method"),
+    [
+        pytest.param(mass, m, marks=pytest.mark.slow if (i - k) % 3 else (), id=f"{name}-{m}")
+        for i, (name, mass) in enumerate(MASSES.items())
+        for k, m in enumerate(OF_MASSES)
+    ],
+)
+def test_gradients_flow_to_masses(mass, method):
     y0, mass = torch.tensor([0.3, 0.5, -0.2, 0.7], dtype=torch.float64), torch.tensor(mass, dtype=torch.float64)
     mass.requires_grad_()
     system = HamiltonianSystem(of_two, ndof=2, mass=mass, y0=y0.numpy())
@@ -418,16 +429,16 @@ def test_gradients_flow_to_masses(mass):
     assert sol.stats["backend"] == "torch"
     (found,) = torch.autograd.grad(sol.y[:, -1].square().sum(), mass)
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-13)
-    for method in ("kahan_li8", "srkn11b", "takahashi_imada", "gauss_legendre6", "rk4"):  # of small steps
-        (near,) = torch.autograd.grad(solve(system, method, (0, 1), y0, dt=0.02).y[:, -1].square().sum(), mass)
-        torch.testing.assert_close(near, expected, rtol=0, atol=0.03)
-        small = 1e-5 * torch.ones_like(mass)
-        ends = [
-            solve(HamiltonianSystem(of_two, ndof=2, mass=(mass + sign * small).detach()), method, (0, 1), y0, dt=0.02)
-            for sign in (1, -1)
-        ]
-        slope = (ends[0].y[:, -1].square().sum() - ends[1].y[:, -1].square().sum()) / 2e-5
-        torch.testing.assert_close(near.sum(), slope, rtol=0, atol=1e-8)
+    # of small steps
+    (near,) = torch.autograd.grad(solve(system, method, (0, 1), y0, dt=0.02).y[:, -1].square().sum(), mass)
+    torch.testing.assert_close(near, expected, rtol=0, atol=0.03)
+    small = 1e-5 * torch.ones_like(mass)
+    ends = [
+        solve(HamiltonianSystem(of_two, ndof=2, mass=(mass + sign * small).detach()), method, (0, 1), y0, dt=0.02)
+        for sign in (1, -1)
+    ]
+    slope = (ends[0].y[:, -1].square().sum() - ends[1].y[:, -1].square().sum()) / 2e-5
+    torch.testing.assert_close(near.sum(), slope, rtol=0, atol=1e-8)
 
 
 def test_masses_may_change_between_runs():

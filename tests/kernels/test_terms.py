@@ -5,7 +5,6 @@ from functools import partial
 
 import numpy as np
 import pytest
-import sympy as sp
 from watchdog import watched
 
 from sympflow import HamiltonianSystem, solve
@@ -83,29 +82,6 @@ def test_code_does_not_depend_on_how_many_terms_there_are(monkeypatch):
         H = HamiltonianSystem.from_sympy(" + ".join([*(f"p{i}**2/2" for i in range(1, n + 1)), *springs]))
         term_code(Splitting(H.symbols, FORCE_GRADIENT)).function("run", 1)
     assert len(texts) == 1
-
-
-def test_terms_that_differ_in_coordinates_and_constants_are_one_family():
-    symbols = SYSTEM.symbols
-    springs, *others = terms.families(symbols.V, symbols.q)
-    sizes = sorted(len(family.coordinates) for family in (springs, *others))
-    assert sizes == [1, 2, 2, SITES - 1, SITES - 1]  # cosine; squares and cubes
-    (masses,) = terms.families(symbols.T, symbols.p)
-    assert masses.coordinates.shape == (SITES, 1)
-
-
-def test_families_add_up():
-    q = sp.symbols("q1:4", real=True)
-    V = sp.sympify(
-        "3*(q1*q2 + q2*q3 - 2*q3**2) + sin(2*q1) - sin(3*q2) + exp(-q3)*q1**3 + Max(q1, 0)",
-        locals={s.name: s for s in q},
-    )
-    total = sp.S.Zero
-    for family in terms.families(V, q):
-        for places, constants in zip(family.coordinates, family.constants, strict=True):
-            values = [*(q[i] for i in places), *map(sp.nsimplify, constants)]
-            total += family.f.xreplace(dict(zip((*family.x, *family.c), values, strict=True)))
-    assert sp.expand(total - V) == 0
 
 
 def test_the_modes_of_many_degrees_of_freedom_are_arrays():
