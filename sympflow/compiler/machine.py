@@ -112,7 +112,8 @@ def given(arguments: Sequence[Any]) -> list[Any]:
         return [address(x) if isinstance(x, np.ndarray) else x for x in arguments]
 
 
-_BYTE, _PLACE = ctypes.c_char.from_buffer, ctypes.addressof
+_BYTE: Any = ctypes.c_char.from_buffer
+_PLACE = ctypes.addressof
 
 
 def _object_code(text: str) -> bytes:
