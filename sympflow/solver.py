@@ -97,7 +97,8 @@ def solve(
     Parameters
     ----------
     system : HamiltonianSystem
-        Or the name of a scene, such as "henon-heiles", or H as a formula, such as "p**2/2 + q**4/4".
+        Or the name of a scene, such as "henon-heiles", H as a formula, such as "p**2/2 + q**4/4", or a system in a
+        file of your own, "own.py:name" or "own.toml".
     method : str, Integrator, or trained flow, optional
         A name from `sympflow.available()`; or a configured integrator such as ``get("verlet")(dt=0.05)``; or a flow. By
         default one that suits the system, the first of these that applies: a flow that ships for it ("sympflow");
