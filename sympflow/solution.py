@@ -177,7 +177,7 @@ class Solution(Answering):
         Raises
         ------
         ValueError
-            If the system is no doubled one.
+            If the system is not doubled.
 
         Warns
         -----
@@ -301,7 +301,7 @@ class Solution(Answering):
         )
 
     def to_xarray(self, energy: bool = True) -> xarray.Dataset:
-        """The solution as an `xarray.Dataset`, from which `to_netcdf` and `to_zarr` of xarray write files.
+        """The solution as an `xarray.Dataset`; its `to_netcdf` and `to_zarr` write files.
 
         Variables are `q` and `p` with the dimensions (..., dof, time), `energy` (..., time), the initial states `q0`
         and `p0` (..., dof), `status` (...), and of each event i its times `t_event_i` and states. A batch has the

@@ -6,7 +6,7 @@ import math
 import os
 import time
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -41,7 +41,7 @@ from sympflow.integrators.choosing import check_tolerance, choose_method, state_
 from sympflow.integrators.contract import Failure, Integrator, Interrupted, Outcome, Problem
 from sympflow.integrators.diagnosis import diagnose, diagnose_piece, note_poles, note_singularities_of_rows
 from sympflow.integrators.domain_exit import check_domain, check_system_along
-from sympflow.integrators.grid import MOST_OPEN_STEPS, no_event
+from sympflow.integrators.grid import MOST_OPEN_STEPS, Grid, no_event
 from sympflow.integrators.grid_runs import report_lanes
 from sympflow.integrators.impulses import landings, run_in_pieces
 from sympflow.integrators.problems import (
@@ -212,8 +212,8 @@ def solve(
     if moving is not None:
         if events is not None or dense_output or store is not None or params is not None:
             raise ValueError(
-                "`t_span` or `t_eval` requires gradients, which flow through no `events`, `dense_output`, `store` or "
-                "`params`: pass `.detach()`, or leave these out; of values for all trajectories make the system, by "
+                "`t_span` or `t_eval` requires gradients, which do not flow through `events`, `dense_output`, `store` "
+                "or `params`: pass `.detach()`, or leave these out; of values for all trajectories make the system, by "
                 "system.with_params(...)."
             )
         t_span, t_eval = moving.numbers
@@ -387,11 +387,15 @@ def _solved(integrator: Integrator, problem: Problem, action: str, rows: Paramet
     check_applies(integrator, between, y_start)
     integrator.check_library(y_start)
     run: Callable[[Integrator, Problem], tuple[Outcome, Problem]] = _run
-    able = problem.store is None and problem.parameter_values is None
-    told, jumps = landings(integrator, between, problem.t0, problem.t1, able, kinks=rows is None)
+    able = problem.store is None and (rows is None or problem.parameter_values is None or _alike_in_time(problem, rows))
+    driven = between if rows is None or problem.parameter_values is None else rows.system_of(0).between_impulses
+    told, jumps = landings(integrator, driven, problem.t0, problem.t1, able)
     if told:
-        without = "a `store`" if problem.store is not None else "gradients by `params`, and with `t_eval`"
-        warn(told if able else f"{told} Without {without}, steps end at jumps.", RuntimeWarning)
+        without = "Without a `store`" if problem.store is not None else "With one value of `params` at a time"
+        warn(told if able else f"{told} {without}, steps end there.", RuntimeWarning)
+    if jumps and rows is not None and problem.t_eval is None and (length := integrator.step_length(between)):
+        outputs = Grid(problem.t0, problem.t1, length).outputs(None, problem.save_every)
+        problem = replace(problem, t_eval=outputs)  # the same of all trajectories
     if between is not system:
         _check_impulses(problem, integrator)
     if between is not system or jumps:
@@ -442,35 +446,43 @@ def _solved_followed(integrator: Integrator, problem: Problem, action: str, rows
     together = replace(problem, parameter_values=parameter_values, followed=followed, diagnosed=False)
     if problem.system.between_impulses is not problem.system or problem.events is not None or action == "stop":
         raise ValueError(
-            f"`params` has {', '.join(rows.followed)} that require gradients, which flow through no `events`, "
+            f"`params` has {', '.join(rows.followed)} that require gradients, which do not flow through `events`, "
             "impulses, or `on_domain_exit` 'stop': detach them, or leave these out."
         )
     integrator.check_followed(together)
-    _check_jumps_stay(problem, rows)
+    if (name := _moving(problem, rows, rows.followed)) is not None:
+        raise ValueError(
+            f"`params` has {name} that requires gradients and moves the times at which H jumps in t, which "
+            "gradients do not follow: detach it, or make the jump smooth, such as (1 + tanh((t - c)/w))/2."
+        )
     sol = _solved(integrator, together, action, rows)
     sol.rows = rows
     return sol
 
 
-def _check_jumps_stay(problem: Problem, rows: ParameterRows) -> None:
-    """Refuse gradients by parameters that move jumps of H in t: they would lack what the jumps contribute."""
+def _alike_in_time(problem: Problem, rows: ParameterRows) -> bool:
+    """Return True if H jumps, and has its kinks, at the same times for all trajectories."""
+    varied = [name for name, value in rows.values.items() if np.ptp(value) > 0]
+    return _moving(problem, rows, varied, kinks=True) is None
+
+
+def _moving(problem: Problem, rows: ParameterRows, names: Iterable[str], kinks: bool = False) -> str | None:
+    """The first of some parameters that moves the times at which H jumps in t, or has `kinks`."""
     system = problem.system
     if not system.definition.may_jump:
-        return
+        return None
 
-    def jumps(values: dict[str, float]) -> np.ndarray:
+    def times(values: dict[str, float]) -> np.ndarray:
         between = system.with_params(**values)
-        return between.jump_times(min(problem.t0, problem.t1), max(problem.t0, problem.t1), between.dt / 4)
+        return between.jump_times(min(problem.t0, problem.t1), max(problem.t0, problem.t1), between.dt / 4, kinks)
 
     for place in (0, -1):
         values = {name: float(np.ravel(value)[place]) for name, value in rows.values.items()}
-        for name in rows.followed:
+        for name in names:
             near = values | {name: values[name] + 1e-6 * (abs(values[name]) or 1.0)}
-            if not np.array_equal(jumps(values), jumps(near)):
-                raise ValueError(
-                    f"`params` has {name} that requires gradients and moves the times at which H jumps in t, which "
-                    "gradients do not follow: detach it, or make the jump smooth, such as (1 + tanh((t - c)/w))/2."
-                )
+            if not np.array_equal(times(values), times(near)):
+                return name
+    return None
 
 
 def _solved_rows(integrator: Integrator, problem: Problem, action: str, rows: ParameterRows) -> Solution:
@@ -627,7 +639,7 @@ def _fits(outcome: Outcome, y0: Array) -> bool:
 
 
 def _check_outcome(outcome: Any, integrator: Integrator, y0: Array) -> None:
-    """Refuse what is no answer (of a plug-in), and flag states that are not finite, whatever the method says."""
+    """Refuse an invalid answer of a plug-in, and flag states that are not finite, whatever the method says."""
     if not (isinstance(outcome, Outcome) and _fits(outcome, y0)):
         what = type(outcome).__name__
         if isinstance(outcome, Outcome):

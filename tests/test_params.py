@@ -47,13 +47,6 @@ class TestTrajectories:
             else:
                 np.testing.assert_array_equal(sol.y[i], own(system, method, y0, i, **options).y[0])
 
-    def test_arrays_compiled_or_not_agree(self, system, y0):
-        compiled, arrays = (
-            solve(system, "verlet", (0, 3), y0, params={"lam": LAM}, dt=0.25, backend=backend)
-            for backend in ("compiled", "array")
-        )
-        np.testing.assert_allclose(compiled.y, arrays.y, rtol=0, atol=1e-14)
-
     @pytest.mark.parametrize("damping", [None, [0.1, 0.3]])
     def test_one_run_takes_drives_and_friction(self, damping, monkeypatch):
         H = "(p1**2 + p2**2)/(2*m) + (1 + a*cos(w*t))*k*(q1**2 + q2**2)/2 - c*q1*q2"
@@ -125,7 +118,7 @@ class TestTrajectories:
     def test_friction_is_no_parameter(self):
         damped = HamiltonianSystem.from_sympy("p**2/2 - g*cos(q)", params={"g": 1.0}, damping=0.1)
         with pytest.raises(
-            ValueError, match=r"'damping', no parameter .* `damping` is not one: make a system for each value"
+            ValueError, match=r"'damping', which is not .* `damping` is not one: make a system for each value"
         ):
             solve(damped, "verlet", (0, 1), [1.0, 0.0], params={"damping": [0.1, 0.2]}, dt=0.1)
 
@@ -168,7 +161,7 @@ class TestRefusals:
     @pytest.mark.parametrize(
         ("params", "error", "words"),
         [
-            ({"x": 1.0}, ValueError, "no parameter of 'hh', which has lam, m"),
+            ({"x": 1.0}, ValueError, "not a parameter of 'hh', which has lam, m"),
             ({"lam": "a"}, TypeError, "finite real numbers"),
             ({"lam": [True]}, TypeError, "finite real numbers"),
             ({"lam": [1.0, np.nan]}, ValueError, r"lam = nan at \(1,\)"),
@@ -222,7 +215,7 @@ def test_a_drive_of_amplitude_zero_is_none():
     options = {"dt": 0.1, "backend": "array"}
     sol = solve(driven, "gauss_legendre4", (0, 1), driven.y0, params={"a": [0.0, 0.3]}, **options)
     np.testing.assert_array_equal(sol.y[0], solve(free, "gauss_legendre4", (0, 1), [free.y0], **options).y[0])
-    with pytest.raises(ValueError, match="the values that `system` has make it constant in time"):
+    with pytest.raises(ValueError, match="with the values of `system` it does not"):
         solve(still, "verlet", (0, 1), params={"a": [0.0, 0.3]}, dt=0.1)
     with pytest.raises(ValueError, match="`time` is 't', which H does not depend on"):
         HamiltonianSystem.from_sympy("p**2/2 + q**2/2", time="t")

@@ -15,6 +15,7 @@ import llvmlite.binding as llvm
 
 from sympflow.compiler import elementary  # noqa: F401  (code of functions, which texts are made of)
 from sympflow.compiler.functions import SPECIAL
+from sympflow.compiler.tables import SYMBOL, TABLES
 
 __all__ = ["Host", "address", "compiled", "host"]
 
@@ -63,6 +64,8 @@ def compiled(text: str, name: str, signature: Any) -> Any:
     with _LOCK:
         if SPECIAL in text:
             _resolve(set(re.findall(rf"@({SPECIAL}\w+)\(", text)))
+        for symbol in re.findall(rf"@({SYMBOL}\w+) = external", text) if SYMBOL in text else ():
+            llvm.add_symbol(symbol, TABLES[symbol].values.ctypes.data)
         engine = _LOADED.get(key)
         if engine is None:
             code = _stored(key)

@@ -188,7 +188,7 @@ class FlowMap(KnownFlow, Shown, nn.Module):
         x : tensor, shape (..., 2d)
             In the dtype and on the device of the flow.
         t0 : float or tensor
-            The time of x, of a driven system, for which alone it counts: one, or one for each state.
+            The time of x, for a driven system only: one number, or one for each state.
 
         Raises
         ------
@@ -239,7 +239,7 @@ class FlowMap(KnownFlow, Shown, nn.Module):
         return torch.cat([z[..., : self.ndof], z[..., self.ndof + 1 :]], dim=-1) if self.driven else z
 
     def on_extended(self, extended: HamiltonianSystem) -> Self | None:
-        """Return the same maps of a driven system with a coordinate more, of which the momentum is −∫ ∂H/∂t dt.
+        """Return the same maps of a driven system with one more coordinate, whose momentum is −∫ ∂H/∂t dt.
 
         None where the maps do not use the functions of a system.
         """
@@ -598,9 +598,7 @@ def start_time(t0: Any, x: Tensor, period: float | None) -> Tensor:
     if x.dtype == torch.float64:
         return time
     if period is None:
-        raise TypeError(
-            f"`x` is {x.dtype}, in which times are rounded too much: use float64, or give the system its `period`."
-        )
+        raise TypeError(f"`x` is {x.dtype}, which rounds times too much: use float64, or give the system its `period`.")
     return time % period
 
 

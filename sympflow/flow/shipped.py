@@ -270,8 +270,9 @@ def choose(
             "float64 and without `compensated`: pass these, or "
         )
         raise ValueError(
-            f"`tol` {tol:g} is met by no flow that ships for {system.name!r}{' and can run here' if others else ''} "
-            f"(relative energy errors: {there}): {clock if others else ''}raise it, or train a flow and pass flow=flow."
+            f"`tol` {tol:g} is not met by any flow that ships for "
+            f"{system.name!r}{' and can run here' if others else ''} (relative energy errors: {there}): "
+            f"{clock if others else ''}raise it, or train a flow and pass flow=flow."
         )
     return able[0]
 
@@ -288,7 +289,7 @@ def named(name: str) -> ShippedFlow:
         close = difflib.get_close_matches(name, [f.name for f in _catalogue()], n=3)
         hint = f"Is it {' or '.join(map(repr, close))}? " if close else ""
         raise ValueError(
-            f"`flow` {name!r} is the name of no flow that ships. {hint}`sympflow flows` lists them; flows from other "
+            f"`flow` {name!r} does not name a flow that ships. {hint}`sympflow flows` lists them; flows from other "
             "files are read by sympflow.load."
         )
     return found[0]

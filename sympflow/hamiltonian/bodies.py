@@ -109,7 +109,9 @@ class PairsHamiltonian(LocalHamiltonian):
             names |= {f"{name}1": a, f"{name}2": b}
         for name, letter in zip(self.params, c, strict=True):
             if name in names:
-                raise ValueError(f"`params` gives a value to {name!r}, which is of bodies or pairs: rename it.")
+                raise ValueError(
+                    f"`params` gives a value to {name!r}, which names a quantity of bodies or pairs: rename it."
+                )
             names[name] = letter
         V = parsed("potential", potential, names, "-G*m1*m2/r")
         if r not in V.free_symbols:

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from sympflow.arguments import warn
-from sympflow.arrays import Array, as_tensor, concatenate, is_tensor, jacobian, of_library
+from sympflow.arrays import Array, as_tensor, concatenate, jacobian, library_name, of_library
 from sympflow.hamiltonian.domain import Box, Domain
 from sympflow.hamiltonian.system import HamiltonianSystem
 
@@ -158,7 +158,7 @@ def doubled(
         F = SymbolicForce(system, [0] * system.ndof if force is None else force, params)
         if system.conservative and F.has_potential:
             warn(
-                "`force` is that of a potential, which keeps an energy: put it into H, and solve that system.",
+                "`force` derives from a potential, so that an energy is kept: put it into H, and solve that system.",
                 UserWarning,
             )
         time = None if system.symbols.time is None else {"time": system.symbols.time, "period": system.period}
@@ -177,10 +177,8 @@ class GivenForce:
         self.force = force
 
     def __call__(self, q: Array, p: Array, *t: Any) -> Array:
-        import torch
-
-        value = self.force(torch.as_tensor(q), torch.as_tensor(p))
-        got = tuple(value.shape) if is_tensor(value) else type(value).__name__
+        value = self.force(as_tensor(q), as_tensor(p))
+        got = tuple(value.shape) if library_name(value) == "torch" else type(value).__name__
         if got != tuple(p.shape):
             raise ValueError(
                 f"`force` must return a tensor of the shape of p, {tuple(p.shape)}; got {got}: write it with torch "

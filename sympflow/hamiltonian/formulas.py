@@ -16,18 +16,19 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from sympflow.arrays import Array, assemble, is_tensor
+from sympflow.arrays import Array, assemble, beside
 from sympflow.compiler.functions import apply, where
 from sympflow.compiler.program import CONDITIONS, Program, Recording, Traced, gradient, tangent, traced
 
 if TYPE_CHECKING:
+    from sympflow.hamiltonian.poles import Poles
     from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 
 
 MOST_IN_SYMBOLS = 300  # operations
 MOST_COMPILED = 5000  # operations of a gradient
 _JUMPING = {"sign", "floor", "mod", "where", "lt", "le", "eq", "atan2"}
-_BENDING = {"abs", "min", "max", "asin", "acos"}
+_BENDING = {"abs", "min", "max", "asin", "acos", "acosh", "sqrt", "pow"}
 _OF_FIRST = "pow log log1p tan sqrt acos asin acosh atanh gamma lgamma digamma ellipk bose csch"
 _SINGULAR = {"div": 1} | dict.fromkeys(_OF_FIRST.split(), 0)
 """The argument by which an operation is infinite or no number."""
@@ -258,12 +259,9 @@ class TracedHamiltonian:
     def _assembled(self, program: Program, x: Array, *t: Any, more: Sequence[Array] = ()) -> Array:
         arrays = (x, *more)
         columns = [a[..., i] for a in arrays for i in range(a.shape[-1])]
-        if is_tensor(x):
-            import torch
-
-            t = tuple(torch.as_tensor(s, dtype=x.dtype, device=x.device) for s in t)
+        times = [beside(s, x) for s in t[: self.time is not None]]
         with np.errstate(all="ignore"):
-            values = program(*t[: self.time is not None], *columns)
+            values = program(*times, *columns)
         return assemble(values, sum(columns[:: max(x.shape[-1], 1)]) if more else columns[0])
 
 
@@ -325,9 +323,10 @@ class TracedPoles:
         return self.exact.sizes(y, t) if self.exact else np.empty((*y.shape[:-1], 0))
 
     @property
-    def exact(self) -> Any:
+    def exact(self) -> Poles | None:
         """The places in symbols, None if they cannot be written."""
-        return self._form.written and self._form.written.poles
+        written = self._form.written
+        return None if written is None else written.poles
 
 
 def _between_roots(g: Traced) -> tuple[Any, Any] | None:

@@ -8,7 +8,19 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from sympflow.arrays import Array, concatenate, is_tensor, largest, library, like, of_library, per_state, to_numpy
+from sympflow.arrays import (
+    Array,
+    as_tensor,
+    concatenate,
+    is_tensor,
+    jvp,
+    largest,
+    library,
+    like,
+    of_library,
+    per_state,
+    to_numpy,
+)
 from sympflow.hamiltonian.definition import bare_copy
 from sympflow.hamiltonian.formulas import TracedHamiltonian, recorded
 from sympflow.hamiltonian.friction import FRICTIONLESS, Friction
@@ -197,9 +209,9 @@ class Hamiltonian:
         return forced
 
     def as_doubled(self) -> Any:
-        """Return the system itself if it is a doubled one; a ValueError if it is none."""
+        """Return the system itself if it is doubled; a ValueError otherwise."""
         raise ValueError(
-            f"`system` {self.called} is not doubled: its states are the physical ones: make one "
+            f"`system` {self.called} is not doubled, so that its states are the physical ones: make one "
             "by sympflow.doubled(system, force), or leave out what asks for its physical limit."
         )
 
@@ -213,7 +225,7 @@ class Hamiltonian:
         )
 
     def identity_parts(self) -> Any:
-        """Return all that H and the equations of motion are made of, by which a store knows the system again."""
+        """Return all that H and the equations of motion are made of; a store recognises the system by it."""
         return [
             self.definition,
             self.inverse_mass,
@@ -256,6 +268,14 @@ class Hamiltonian:
             )
         if self.friction:
             raise ValueError(f"`system` {self.called} has friction, p' = −∂H/∂q − Γp, {what}: {remedy}.")
+
+    def check_damped_drifts(self) -> None:
+        """Refuse friction of a kinetic energy that is not quadratic, whose drifts with friction are not known."""
+        if self.friction and not self.quadratic_kinetic:
+            raise ValueError(
+                f"`system` {self.called} has friction, which drifts hold where the kinetic energy is ½ pᵀM⁻¹p: use a "
+                "Runge–Kutta method such as 'dop853'."
+            )
 
     def check_autonomous(self, what: str, remedy: str) -> None:
         """Refuse a driven system, H(t, q, p), by a ValueError with `what` leaves the time out and the remedy."""
@@ -377,14 +397,8 @@ class Hamiltonian:
         if self.definition.has_third_derivative:
             return self.definition.third_derivative(q, v, w, *self._time(t, q))
         if self.numba_functions is None and (self.definition.differentiates_itself or is_tensor(q)):
-            import torch
-
-            from sympflow.arrays import jvp
-
-            x, along, other = (torch.as_tensor(each) for each in (q, v, w))
-            found = jvp(lambda z: self.hessian_vector(z, other, t), x, along)[1]
-            return of_library(found, q)
-
+            x, along, other = map(as_tensor, (q, v, w))
+            return of_library(jvp(lambda z: self.hessian_vector(z, other, t), x, along)[1], q)
         return third_derivative(self, q, v, w, t)
 
     def _with_acceleration(self) -> Hamiltonian:
@@ -415,9 +429,9 @@ class Hamiltonian:
         """∇T(p): (..., d) to (..., d)."""
         if not self._separable().quadratic_kinetic:
             return self.definition.kinetic_gradient(p, *self._kinetic_time(t, p))
-        if self.followed_mass is not None and is_tensor(p):
-            mass = self.followed_mass.to(p)
-            return p / mass if mass.ndim < 2 else p @ mass.inverse().mT
+        if self.followed_mass is not None:
+            mass = like(of_library(self.followed_mass, p), p)
+            return p / mass if mass.ndim < 2 else p @ library(p).linalg.inv(mass).mT
         if self.inverse_mass is None:
             return p
         M = like(self.inverse_mass, p)
@@ -537,7 +551,7 @@ class Hamiltonian:
 
     @property
     def few_sites(self) -> Self:
-        """A few of the sites of a lattice, by which a flow for any size knows it; else the system itself."""
+        """A lattice of a few sites, by which a flow for any size recognises it; else the system itself."""
         return self
 
     @property

@@ -22,7 +22,10 @@ from sympy.printing.codeprinter import PrintMethodNotImplementedError
 
 from sympflow.arguments import check_kept, plain
 from sympflow.arrays import Array, assemble, beside, concatenate, library_name
+from sympflow.compiler import NotCompiled
 from sympflow.compiler.functions import apply
+from sympflow.compiler.program import Program
+from sympflow.compiler.program import gradient as slopes
 from sympflow.hamiltonian.definition import Definition
 from sympflow.hamiltonian.driving import (
     DURATION,
@@ -40,19 +43,23 @@ from sympflow.hamiltonian.jumps import (
     MOST_POINTS,
     Impulse,
     Switch,
+    Touch,
     Zeros,
     borders,
     check_continuous,
     has_period,
     refuse_deltas,
     split_impulses,
+    touches,
 )
 from sympflow.hamiltonian.poles import Poles, SymbolicPoles
+from sympflow.hamiltonian.recorded import recorded
 from sympflow.hamiltonian.removable import BOUNDED, Max, sinc
 
 LARGEST, TINY = sys.float_info.max, 1e-150
 MOST_LEFT_OUT = 100  # degrees of freedom up to the last one that a formula may do without
 LONGEST_NAME = 40  # in messages
+MOST_WRITTEN = 16  # variables of a Hessian whose entries are written out
 MOST_COORDINATES = 10_000  # degrees of freedom of an H that is written out
 FAR = 1000.0
 """The time before and after 0 in which it is looked if H jumps, where that is at no zeros of linear functions."""
@@ -130,7 +137,7 @@ class SymbolicHamiltonian(Definition):
             raise ValueError("`expression` must depend on q1 … qd and p1 … pd (or q and p).")
         if ndof - len(used) > MOST_LEFT_OUT:
             raise ValueError(
-                f"`expression` has coordinates of the number {str(ndof)[:20]}, and depends on {len(used)} degrees of "
+                f"`expression` has coordinates numbered up to {str(ndof)[:20]}, and depends on {len(used)} degrees of "
                 "freedom: number them from 1, q1 … qd and p1 … pd."
             )
         if ndof > MOST_COORDINATES:
@@ -259,12 +266,13 @@ class SymbolicHamiltonian(Definition):
         return bool(self.samples or self._switches)
 
     @cached_property
-    def _switches(self) -> list[Switch]:
-        """Borders at which H may jump in t alone."""
+    def _switches(self) -> list[Switch | Touch]:
+        """Places at which H may jump, or have a kink, in t alone."""
         if self.time is None:
             return []
         own = [border for border in borders(self.H, [self.time], kinks=True) if border.g.free_symbols == {self.time}]
-        return [Switch(border, self.time, self.samples) for border in own]
+        jumping = [Switch(border, self.time, self.samples) for border in own]
+        return [*jumping, *touches(self.H, self.time, self.samples)]
 
     def jump_times(self, low: float, high: float, step: float, kinks: bool = False) -> np.ndarray:
         found = [samples.jump_times(low, high) for samples in self.samples.values()]
@@ -407,14 +415,22 @@ class SymbolicHamiltonian(Definition):
             f, x = getattr(self, name), self._variables(name)
             return [f] if order == 0 else gradient(f, x) if order == 1 else list(hessian(f, x))
 
-        return self._function(name + "'" * order, expressions, (_single, assemble, _square)[order])
+        key, n = name + "'" * order, len(self._variables(name))
+        if order == 2 and n > MOST_WRITTEN:
+            return self._function(key, lambda: [getattr(self, name)], _square, partial(_hessian_by_program, n))
+        return self._function(key, expressions, (_single, assemble, _square)[order])
 
     def _function(
-        self, key: str, expressions: Callable[[], list[sp.Expr]], collect: Callable[[Sequence[Array], Array], Array]
+        self,
+        key: str,
+        expressions: Callable[[], list[sp.Expr]],
+        collect: Callable[[Sequence[Array], Array], Array],
+        make: Callable[..., Callable[..., list[Any]]] | None = None,
     ) -> Callable[..., Array]:
-        """A function of an array (..., n), and of the time, generated for NumPy or torch when first called with one."""
+        """A function of an array (..., n), and of the time, made for NumPy or torch when first called with one."""
         if key in self._functions:
             return self._functions[key]
+        make = generate if make is None else make
         name = key.rstrip("'")
         variables = self._variables(name)
         n, timed = len(variables), self.kinetic_timed if name in ("T", "drift") else self.timed
@@ -427,7 +443,7 @@ class SymbolicHamiltonian(Definition):
             if library not in generated:
                 wanted, sample_symbols = with_symbols([printable(f) for f in expressions()])
                 values_of_samples[:] = [(a, sp.lambdify(moving, a.at, modules=[])) for a in sample_symbols]
-                generated[library] = generate(
+                generated[library] = make(
                     wanted, (*variables, *moving, *self.parameters, *sample_symbols.values()), library
                 )
             columns = [x[..., i] for i in range(n)]
@@ -591,7 +607,7 @@ def _check_values(H: sp.Expr, values: Mapping[sp.Symbol, sp.Expr]) -> None:
     numbers = [abs(a) for a in H.atoms(sp.Number)]
     if H.has(sp.zoo, sp.nan, sp.oo) or complex_part(H) is not None or any(a > LARGEST for a in numbers):
         shown = ", ".join(f"{s} = {float(value):.9g}" for s, value in values.items() if value.is_number)
-        raise ValueError(f"`params` has {shown}, with which the expression is not a finite real one: change them.")
+        raise ValueError(f"`params` has {shown}, but then the expression is not a finite real one: change them.")
 
 
 def _check_samples(written: sp.Expr, values: Mapping[sp.Symbol, sp.Expr]) -> None:
@@ -601,8 +617,8 @@ def _check_samples(written: sp.Expr, values: Mapping[sp.Symbol, sp.Expr]) -> Non
         if isinstance(value, sampled) and all(term.free_symbols <= values.keys() for term in terms if term.has(symbol)):
             raise ValueError(
                 f"`params` has {symbol.name}, a spline, which is a function of the time: in a term without q and p it "
-                "moves nothing. Give a potential by functions, HamiltonianSystem(V, ndof=…, gradient=…); where it is "
-                "the time that is meant, pass time='t'."
+                "moves nothing. Give a potential by a function, HamiltonianSystem(lambda q: V(q[..., 0]), ndof=1); "
+                "where it is the time that is meant, pass time='t'."
             )
 
 
@@ -782,6 +798,20 @@ def generate(expressions: Sequence[sp.Expr], variables: Sequence[sp.Symbol], lib
     return summed
 
 
+def _hessian_by_program(
+    n: int, expressions: Sequence[sp.Expr], variables: Sequence[sp.Symbol], library: str
+) -> Callable[..., list[Any]]:
+    """∇²f by the first n variables, row by row: the program of f is differentiated sooner than its expression."""
+    (f,) = expressions
+    try:
+        program = recorded(f, variables)
+    except NotCompiled:
+        return generate(list(hessian(f, variables[:n])), variables, library)
+    x = program.inputs[:n]
+    rows = [slopes(s, x[: i + 1]) for i, s in enumerate(slopes(program.outputs[0], x))]
+    return Program(program.inputs, [rows[max(i, j)][min(i, j)] for i in range(n) for j in range(n)])
+
+
 def _by_products(f: sp.Expr) -> sp.Expr:
     """Integer powers beyond squares by a function that multiplies: NumPy raises to them by logarithms."""
 
@@ -844,11 +874,11 @@ def _modules(library: str, code: list[sp.Expr]) -> list[Any]:
     special = sorted(names - known - {"Max", "Min", "Abs", "Heaviside", "sign", "Piecewise", *BOUNDED})
     if library == "numpy":
         own = {"integer_power": _integer_power, "Heaviside": np.heaviside}
-        return [own | _special_functions(), "scipy", "numpy"] if special else [own, "numpy"]
+        return [own | _special_functions(), "scipy", np] if special else [own, np]  # by its name SymPy loads all of it
     if special:
         raise TypeError(
-            f"`expression` holds {', '.join(special)}, which torch has not: solve on NumPy states, with a method that "
-            "does not need tensors."
+            f"`expression` holds {', '.join(special)}, which torch does not have: solve on NumPy states, with a method "
+            "that does not need tensors."
         )
     import torch
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sympflow.arguments import advice, check_flag, check_positive, checked_count, floats, real_number, told, warn
-from sympflow.arrays import Array, differentiable, is_tensor, one_lane, to_numpy
+from sympflow.arrays import Array, learnable, one_lane, to_numpy
 from sympflow.hamiltonian.definition import bare_copy
 from sympflow.hamiltonian.domain import Domain, domain_of
 from sympflow.hamiltonian.fingerprint import fingerprint
@@ -137,7 +137,7 @@ class Scene:
         try:
             state = floats("y0", self.y0)
         except OverflowError:
-            raise ValueError("`y0` must be finite: it has an integer that no float is near.") from None
+            raise ValueError("`y0` must be finite: it has an integer too large for a float.") from None
         if state.shape != (2 * ndof,):
             raise ValueError(f"`y0` must have shape ({2 * ndof},), [q, p]; got {state.shape}.")
         return state
@@ -193,8 +193,8 @@ class HamiltonianSystem(Hamiltonian, Answering):
         The period in t of H, of a driven system; other values than its own are a ValueError. Sections and multipliers
         take it.
     damping : float or array_like of shape (d,) or (d, d), optional
-        Γ: one rate, one for each p, or a symmetric positive semi-definite matrix; 0 is none. The splitting methods on
-        the splitting "kinetic" and the Runge–Kutta methods solve it; all else refuses it, with the reason.
+        Γ: one rate, one for each p, or a symmetric positive semi-definite matrix; 0 for none. Splitting
+        methods on the splitting "kinetic" and the Runge–Kutta methods solve it; all else refuses it, with the reason.
     name : str
     domain : Domain, optional
         Ω, where flows are trained. Classical methods never need one.
@@ -293,7 +293,7 @@ class HamiltonianSystem(Hamiltonian, Answering):
             if value is not None and not definition.separable:
                 raise TypeError(f"`{argument}` only goes with `potential`: leave it out, it is part of `hamiltonian`.")
         M: Any = mass
-        followed = M if is_tensor(M) and (M.requires_grad or differentiable(M)) else None
+        followed = M if learnable(M) else None
         M = M if followed is None else to_numpy(M)
         inverse_mass, quadratic = checked_inverse_mass(M, d) if definition.separable else None, definition.separable
         K = None if stiffness_matrix is None else checked_stiffness(stiffness_matrix, d)
@@ -794,7 +794,7 @@ class HamiltonianSystem(Hamiltonian, Answering):
 
     @property
     def params(self) -> Mapping[str, float]:
-        """The values of the parameters, read-only: they are part of H, from which all code is generated.
+        """The values of the parameters, read-only, because code is generated from them.
 
         A system with others is made by `HamiltonianSystem.from_sympy`, or by the function of its scene.
         """
@@ -810,7 +810,7 @@ class HamiltonianSystem(Hamiltonian, Answering):
             return
         if self.symbols is None:
             raise TypeError(
-                f"`params` are of symbolic systems, and {self.called} is given by functions, which hold their values: "
+                f"`params` are for symbolic systems, and {self.called} is given by functions, which hold their values: "
                 "make a system for each, or define it with HamiltonianSystem.from_sympy(..., params=...)."
             )
         if self.external_force is not None:
@@ -823,7 +823,7 @@ class HamiltonianSystem(Hamiltonian, Answering):
                 has = f"which has {', '.join(known)}" if known else "which has none: write H with symbols for them"
                 if name == "damping" and self.damping is not None:
                     has += "; `damping` is not one: make a system for each value"
-                raise ValueError(f"`params` has {name!r}, no parameter of {self.called}, {has}.")
+                raise ValueError(f"`params` has {name!r}, which is not a parameter of {self.called}, {has}.")
 
     @told
     def with_params(self, **values: float) -> HamiltonianSystem:

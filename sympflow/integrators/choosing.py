@@ -198,7 +198,7 @@ def choose_step(
     t_span: tuple[float, float] | None = None,
     tol_of: str = "energy",
 ) -> float:
-    """Return the longest step, within a factor of two or so, with which a fixed-step method meets a tolerance.
+    """Return the longest step, within a factor of about two, that lets a fixed-step method meet a tolerance.
 
     It is found by a few short runs from the given states: of 4096 steps, and over 400 times `system.dt` at least, or
     over the whole of `t_span` where that is shorter.
@@ -248,7 +248,7 @@ def choose_step(
 
 
 def check_tolerance(tol: Any, tol_of: Any) -> None:
-    """Refuse what is no tolerance."""
+    """Refuse anything but a tolerance."""
     if not 0 < as_float(tol) < 1:
         raise ValueError(f"`tol` must be a positive number below 1, a relative error; got {tol!r}: take 1e-6.")
     if tol_of not in ("energy", "state"):
@@ -333,7 +333,7 @@ def _error(integrator: FixedStep, problem: Problem, tol_of: str, trial: float) -
         with np.errstate(all="ignore"):
             stepped = replace(integrator, dt=h)
             piece = replace(problem, t1=float(t[-1]), t_eval=t, diagnosed=False)
-            _, jumps = landings(stepped, system, piece.t0, piece.t1, kinks=True)
+            _, jumps = landings(stepped, system, piece.t0, piece.t1)
             outcome = run_in_pieces(lambda *given: (given[0].run(given[1]), given[1]), stepped, piece, jumps)[0]
         nonlocal compiled
         compiled = outcome.stats.get("backend") == "compiled"

@@ -15,11 +15,11 @@ from weakref import WeakSet
 import numpy as np
 
 from sympflow.arguments import warn
-from sympflow.arrays import Array, is_tensor, masked, readable, to_numpy
+from sympflow.arrays import Array, masked, readable, to_numpy
 from sympflow.hamiltonian.scales import known_scale, rate_of_motion
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep
-from sympflow.integrators.contract import Integrator, Outcome, Problem
+from sympflow.integrators.contract import Failure, Integrator, Outcome, Problem
 from sympflow.integrators.domain_exit import check_domain, check_system_along, warn_of_loss
 
 if TYPE_CHECKING:
@@ -52,6 +52,9 @@ SAFE = 4  # steps of so many `dt` of a system are not looked at in a run of few
 FEWEST_NEAR, LOST_DIGITS = 100, 1e-9
 """The closest of so many steps, or of all, to a value where terms cancel is that part of the way from it; a force with
 that share of errors there is told."""
+STRAIGHT = 1 - 1e-9  # of the squared cosine of velocity and acceleration, of a motion that may lead to a centre
+NUDGE = 1e-9  # of the momenta, by which forces change them to show the way of what is at rest
+TURNING = Failure.CLOCK, Failure.ENCOUNTER  # breakdowns of methods that turn at an exact collision
 NO_FORCE = (
     "At the last state the force is NaN: write H without parts that overflow, such as exp(800), or are 0/0; shorter "
     "steps do not help. Start elsewhere"
@@ -91,6 +94,8 @@ def diagnose(
     told = not interrupted and diagnose_piece(outcome, integrator, problem, rows)
     values, between = readable(outcome.y), system.between_impulses
     held = values and problem.store is None and not _failed(outcome)
+    if held and not told and problem.parameter_values is None:
+        told = warn_of_collision(outcome, integrator, problem)
     if held and system.definition.leaps and problem.parameter_values is None:
         told = warn_of_leap(outcome, system, y0) or told
     if values and system.functions_given:
@@ -174,11 +179,44 @@ def note_poles(
         passage, which = found[likely[0]], _which(problem, likely, values)
         warn(
             f"H{which} changed for good between t = {passage.begin:.10g} and {passage.end:.10g}, where a step leapt "
-            f"over a place at which it is infinite, {passage.place}: the run means nothing after that. "
+            f"over a place at which it is infinite, {passage.place}: the run is meaningless after that. "
             f"{_remedy(integrator, problem)}.",
             RuntimeWarning,
         )
     return [*found.values()]
+
+
+def warn_of_collision(outcome: Outcome, integrator: Integrator, problem: Problem) -> bool:
+    """Warn, and return True, of a run that turns at an exact collision, as those on a clock do, or Kepler's motion."""
+    system, poles = problem.system, problem.system.definition.poles
+    if not isinstance(integrator, FixedStep) or integrator.breakdown not in TURNING or not len(outcome.t):
+        return False
+    if poles is None or not poles.watched:
+        return False
+    d, y0 = system.ndof, to_numpy(problem.y0).reshape(-1, 2 * system.ndof)[:MOST_NAMED].astype(float)
+    with np.errstate(all="ignore"):
+        force, p = -np.asarray(system.gradient(y0))[:, :d], y0[:, d:]
+        sizes, strengths = np.abs(p).max(1, keepdims=True), np.abs(force).max(1, keepdims=True)
+        share = np.where(sizes > 0, NUDGE * sizes, 1.0) / np.maximum(strengths, 1e-300)
+        falling = np.concatenate([y0[:, :d], p + share * force], axis=1)  # of what is at rest, as it begins to move
+        if system.symbols is None and system.local is None:  # whose places are written in symbols for that
+            v, a = (np.asarray(system.gradient(np.concatenate([y0[:, :d], x], axis=1)))[:, d:] for x in (p, force))
+            if ((v * a).sum(1) ** 2 < STRAIGHT * (v * v).sum(1) * (a * a).sum(1)).all():
+                return False
+        exact = poles.exact
+        if not exact or not len(rows := np.flatnonzero(exact.ahead(falling))):
+            return False
+        begin, end = (np.full(len(rows), float(t)) for t in (problem.t0, outcome.t[-1]))
+        times, *_ = _end_of_solution(system, begin, y0[rows], end)
+    met = np.flatnonzero(np.isfinite(times))
+    if len(met):
+        warn(
+            f"The solution{_which(problem, rows[met].tolist(), None)} becomes infinite, at about t = "
+            f"{times[met[0]]:.10g}, by a collision: no step leads beyond that, and the run turns there. End `t_span` "
+            "before, or soften H.",
+            RuntimeWarning,
+        )
+    return bool(len(met))
 
 
 def warn_of_cancelling(outcome: Outcome, problem: Problem) -> None:
@@ -233,7 +271,7 @@ def _steps_of(
     width, length = 2 * problem.system.ndof, integrator.step_length(problem.system)
     y0 = to_numpy(problem.y0).reshape(-1, width)[row]
     known = problem.t_eval is None and problem.save_every == 1 and (length is not None or problem.y0.ndim == 1)
-    for end in () if known or is_tensor(problem.y0) else ends:
+    for end in () if known else ends:
         n_steps = abs(end - problem.t0) / length if length else outcome.stats.get("n_steps", 0)
         if n_steps * width <= MOST_WALKED:
             try:
@@ -361,7 +399,7 @@ def warn_of_long_steps(outcome: Outcome, integrator: Integrator, problem: Proble
     if off > TOO_LONG:
         what, remedy = "`rtol` is too large", "Take rtol=1e-8, or a method of fixed steps with tol=1e-6"
         if dt is not None:
-            what, remedy = f"`dt` {dt:g} is too long", "Take a shorter step, or tol=1e-6, for which it is chosen"
+            what, remedy = f"`dt` {dt:g} is too long", "Take a shorter step, or tol=1e-6, which chooses one"
         warn(f"{what} for method {integrator.label!r}: {told}. {remedy}.", RuntimeWarning)
 
 
@@ -650,7 +688,7 @@ def warn_of_leap(outcome: Outcome, system: HamiltonianSystem, y0: Array) -> bool
     after = f"between t = {outcome.t[first - 1]:.10g} and {outcome.t[first]:.10g}" if first else "by the first output"
     which = "" if len(leapt) == 1 else f" of trajectory {row}, the first of {leapt.sum()},"
     warn(
-        f"The energy{which} went from {H0:.6g} to {H:.6g} over a singularity of V, and the run means nothing after "
+        f"The energy{which} went from {H0:.6g} to {H:.6g} over a singularity of V, and the run is meaningless after "
         f"that. It was lost {after}, where {system.definition.leap(along[first], start)}.",
         RuntimeWarning,
     )

@@ -108,8 +108,8 @@ class _Scipy(RungeKutta):
             finite = bool(np.isfinite(system.vector_field(y0.astype(float), t0)).all())
         if finite and self.atol == 0 and (y0 == 0).any():
             return (
-                f"There is no first step from t = {t0:.15g}: `atol` is 0, and `y0` has components that are 0, of which "
-                "a relative error has no meaning. Give an `atol`, such as `rtol` times the size of the state."
+                f"There is no first step from t = {t0:.15g}: `atol` is 0, and `y0` has components that are 0, "
+                "for which a relative error has no meaning. Give an `atol`, such as `rtol` times the size of the state."
             )
         what = "first step" if finite else "vector field"
         return f"The {what} is not finite at t = {t0:.15g}. Check `y0` and its scale{', or raise `atol`' * finite}."

@@ -28,8 +28,9 @@ from sympflow.integrators.contract import (
     method_class,
 )
 from sympflow.integrators.interpolants import Mapped
+from sympflow.integrators.loops import compiled_loops, stepper_of
 from sympflow.integrators.methods import NAMES, TRIPLES
-from sympflow.integrators.steppers import Stepper, compiled_loops, stepper_of
+from sympflow.integrators.steppers import Stepper
 from sympflow.schemes import CORRECTORS, POLYNOMIAL, SCHEMES, Scheme, checked_scheme, scheme_evaluations, scheme_named
 
 if TYPE_CHECKING:
@@ -435,8 +436,8 @@ def _note_distance(extension: Composition, found: np.ndarray, outcome: Outcome) 
         which = "" if lost.ndim == 0 else f" of {np.count_nonzero(lost)} of {lost.size} trajectories"
         warn(
             f"The two copies{which} that method {extension.method!r} keeps differ by up to {largest:.3g} of the size "
-            "of the states: these say little about the system. Reduce `dt`, or change `omega`, the strength by which "
-            "the copies are bound.",
+            "of the states, which makes the result unreliable. Reduce `dt`, or change `omega`, the strength that "
+            "binds the copies.",
             RuntimeWarning,
         )
 
@@ -488,7 +489,7 @@ def splitting_method(
     Raises
     ------
     TypeError
-        If `scheme` is no scheme, or `name` no string.
+        If `scheme` is not a `Scheme`, or `name` not a string.
     ValueError
         If there is no such scheme, splitting or clock; if the scheme is not consistent; or if the name is that of
         another, built-in method.

@@ -32,8 +32,9 @@ from sympflow.integrators.contract import (
 from sympflow.integrators.grid import Grid
 from sympflow.integrators.impulses import pieces_of
 from sympflow.integrators.interpolants import THIRDS, Batch, Interpolant, Piecewise
+from sympflow.integrators.loops import stepper_of
 from sympflow.integrators.runge_kutta import ExplicitStep, RungeKutta, hopeless, weighted
-from sympflow.integrators.steppers import Stepper, stepper_of
+from sympflow.integrators.steppers import Stepper
 from sympflow.integrators.tableaux import ADAPTIVE, FIXED, MULTISTEP, Tableau
 
 Visit = Callable[[Interpolant], bool]  # takes a step as soon as it is accepted; whether the run ends in it

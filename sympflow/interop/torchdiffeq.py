@@ -341,7 +341,7 @@ def _landing(
 ) -> dict[str, Any] | None:
     """Options with which a method of torchdiffeq ends steps where a HamiltonianSystem jumps in t."""
     known, name = dict(options or {}), method or "dopri5"
-    if not isinstance(func, HamiltonianSystem) or func.autonomous or not isinstance(t, Tensor) or not t.numel():
+    if not isinstance(func, HamiltonianSystem) or not isinstance(t, Tensor) or not t.numel():
         return options
     if {"jump_t", "grid_constructor"} & known.keys():
         return options

@@ -10,8 +10,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import sympy as sp
@@ -122,8 +124,8 @@ def with_parts(total: Any, parts: Sequence[tuple[Any, Sequence[Any]]], axis: int
 class FewSymbols:
     """A few bodies in the place of a symbolic Hamiltonian, whose parameters are all that a pair depends on."""
 
-    T = None
-    samples: ClassVar[Mapping[str, Any]] = {}
+    H = T = None
+    samples: Mapping[str, Any] = MappingProxyType({})
 
     def __init__(self, local: PairsHamiltonian) -> None:
         named = {c.name: value for c, value in zip(local.c, local.constants, strict=True)}
@@ -158,9 +160,11 @@ def few(local: PairsHamiltonian) -> tuple[Callable[..., Splitting] | None, tuple
     return partial(FewSplitting, symbols), symbols.values
 
 
+@dataclass(frozen=True)
 class FewSplitting(Splitting):
     """The kicks and drifts of a few bodies."""
 
+    symbols: FewSymbols
     polynomial = False
 
     @property
@@ -182,6 +186,7 @@ class FewShape(Shape):
 
     @property
     def _local(self) -> PairsHamiltonian:
+        assert isinstance(self.symbols, FewSymbols)
         return self.symbols.local
 
     def _kicked(self) -> list[Any]:

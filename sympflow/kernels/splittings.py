@@ -5,11 +5,11 @@ A kick is p − b∇V + g∇²V v − c∇(½ v·∇²V v) with v = M⁻¹∇V, 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -37,6 +37,30 @@ CLOCK = 3  # numbers of the time in a column
 EARLY = -4  # when momenta are known before the positions, in cycles
 
 
+class Formulas(Protocol):
+    """V and T with their letters: a SymbolicHamiltonian, a TracedHamiltonian, or `FewSymbols` of a few bodies."""
+
+    ndof: int
+    samples: Mapping[str, Any]
+
+    @property
+    def H(self) -> Any: ...
+    @property
+    def V(self) -> Any: ...
+    @property
+    def T(self) -> Any: ...
+    @property
+    def q(self) -> tuple[Any, ...]: ...
+    @property
+    def p(self) -> tuple[Any, ...]: ...
+    @property
+    def parameters(self) -> tuple[Any, ...]: ...
+    @property
+    def values(self) -> tuple[float, ...]: ...
+    @property
+    def inverse_mass(self) -> Any: ...
+
+
 @dataclass(frozen=True)
 class Splitting:
     """The kicks and drifts of one separable system, of a level, with what else they have.
@@ -46,7 +70,7 @@ class Splitting:
     table.
     """
 
-    symbols: Any  # a SymbolicHamiltonian, a TracedHamiltonian, or what is like these
+    symbols: Formulas
     level: int
     monomials: Monomials = ()
     compensated: bool = False

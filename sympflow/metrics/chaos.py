@@ -23,8 +23,8 @@ from sympflow.integrators.contract import FINISHED
 from sympflow.integrators.diagnosis import try_steps
 from sympflow.integrators.grid import Grid
 from sympflow.integrators.impulses import landings
+from sympflow.integrators.loops import compiled_loops
 from sympflow.integrators.registry import naming_plugin
-from sympflow.integrators.steppers import compiled_loops
 from sympflow.metrics.orbits import OfOrbits, Orbits, checked_orbits, of_many
 from sympflow.show.cards import Card
 from sympflow.show.pictures import curves_figure
@@ -262,7 +262,7 @@ def gali(
 
 
 def checked_threshold(below: float) -> float:
-    """`below` as a float; a ValueError if it is no threshold."""
+    """`below` as a float; a ValueError unless it is a threshold."""
     value = as_float(below)
     if not 0 <= value < 1:
         raise ValueError(f"`below` must be a number from 0, to go on to the end, up to 1; got {below!r}.")
@@ -318,7 +318,7 @@ def indicator(
     scale = weights(system)
     w0 = _deviations(deviations, vectors, scale, seed)
     length = integrator.step_length(system) if integrator.on_grid else None
-    told, jumps = landings(integrator, system, t0, t1, backend != "compiled")
+    told, jumps = landings(integrator, system, t0, t1, backend != "compiled", kinks=False)
     if told:
         warn(told, RuntimeWarning)
     if length is not None:

@@ -121,7 +121,7 @@ def escape_times(
 
 
 def region_of(outside: Any, system: HamiltonianSystem) -> Outside:
-    """The function of states that `outside` means; a ValueError or TypeError if it is none."""
+    """The function of states that `outside` means; a ValueError or TypeError if it means none."""
     if outside is None:
         if system.domain is None:
             raise ValueError(

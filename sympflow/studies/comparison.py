@@ -168,7 +168,7 @@ def default_metrics(system: HamiltonianSystem) -> tuple[str, ...]:
         what = "energy" if system.shows_energy else kept_by(system).replace("energy", "")
         kept = {"energy": ("energy", "drift"), "balance": ("balance",)}.get(what, ())
         return ("error", *kept, "volume", "symplecticity")
-    shrinks_evenly = system.external_force is None and system.friction and system.friction.isotropic
+    shrinks_evenly = system.external_force is None and system.friction.isotropic
     return ("error", "conformal") if shrinks_evenly else ("error",)
 
 

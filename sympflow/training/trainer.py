@@ -6,7 +6,7 @@ import copy
 import inspect
 import math
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -15,7 +15,6 @@ import numpy as np
 import torch
 
 from sympflow.arguments import advice, check_one_of, plain, real_number
-from sympflow.arrays import is_tensor
 from sympflow.flow.flow_map import FlowMap
 from sympflow.flow.primed import PrimedFlow
 from sympflow.flow.sympflow import SympFlow
@@ -277,9 +276,9 @@ def _refuse_unknown(options: dict[str, Any]) -> None:
 
 
 def _known_system(system: Any, data: Any) -> HamiltonianSystem:
-    """Return H, of which data alone tell nothing."""
-    is_data = isinstance(system, list | tuple | dict | np.ndarray) or is_tensor(system)
-    if not isinstance(system, HamiltonianSystem | str) and (data is not None or system is None or is_data):
+    """Return H; a TypeError for data without a system."""
+    is_data = isinstance(system, Iterable) or system is None or data is not None
+    if is_data and not isinstance(system, HamiltonianSystem | str):
         raise TypeError(
             f"`system` must be a HamiltonianSystem, the H of the flow; got {type(system).__name__}: train() fits a "
             "flow to an H that is known, and `data` adds labels to that; it finds no H in data. Define H by "

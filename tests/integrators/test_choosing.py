@@ -7,7 +7,6 @@ import pytest
 
 import sympflow
 from sympflow import HamiltonianSystem, choose_step, solve, systems
-from sympflow.hamiltonian.scales import started
 
 text = HamiltonianSystem.from_sympy
 KEPLER = "p1**2/2 + p2**2/2 - 1.1/sqrt(q1**2 + q2**2)"
@@ -195,7 +194,7 @@ def test_errors_that_grow_beyond_the_trial_runs_are_told(system, method, end, as
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
         sol = solve(system, method, (0, end), **asked)
-    exact = solve(system, "dop853", (0, end), t_eval=sol.t[::-1][:: len(sol.t) // 100][::-1], rtol=1e-12, atol=1e-13)
+    exact = solve(system, "dop853", (0, end), t_eval=sol.t[::-1][:: len(sol.t) // 100][::-1], rtol=1e-10, atol=1e-12)
     kept = np.searchsorted(sol.t, exact.t)
     if "tol_of" in asked:
         error = np.abs(sol.y[:, kept] - exact.y).max() / np.abs(system.y0).max()
@@ -216,17 +215,6 @@ def test_trial_runs_end_steps_where_H_jumps(asked):
     error = sympflow.reference_error(sol).max()
     assert 1e-13 < error <= asked["tol"]
     assert 0.5 < sol.stats["state_error"] / error < 2
-
-
-def test_a_start_is_looked_at_once():
-    """Without a y0 in the system, steps and scales come from the states of the run, and are found once."""
-    system, y0 = text(KEPLER), np.array([[1.0, 0.0, 0.0, 0.8], [1.0, 0.0, 0.0, 0.9]])
-    found = started(system, y0)
-    assert found is started(system, y0.copy())
-    assert found.y0.tolist() == y0[1].tolist()  # the highest energy
-    assert found.dt == solve(system, "verlet", (0, 0.1), y0).stats["dt"]
-    assert started(system, 2 * y0) is not found
-    assert started(found, 2 * y0) is found
 
 
 @pytest.mark.parametrize(("sign", "slow"), [(1, True), (-1, False)])

@@ -16,7 +16,6 @@ from sympflow.metrics.symplectic import loop_area, natural_scale, step_tangents
 pytestmark = pytest.mark.filterwarnings("ignore:`dt` .* is too long:RuntimeWarning")
 
 EPS = np.finfo(float).eps
-SPLITTINGS = ["verlet", "leapfrog", "yoshida4", "kahan_li8", "chin4a"]
 
 
 @dataclass(frozen=True)
@@ -35,15 +34,6 @@ class Damped(FixedStep):
             if torch.is_tensor(y)
             else (y * np.repeat([1.0, self.factor], system.ndof))
         )
-
-
-@pytest.mark.parametrize("method", SPLITTINGS)
-@pytest.mark.parametrize("system", [systems.henon_heiles(), systems.pendulum()], ids=lambda s: s.name)
-def test_splittings_keep_volume_and_the_symplectic_form_to_rounding(method, system):
-    sol = solve(system, method, (0, 20), t_eval=np.linspace(0, 20, 7))
-    n_steps, stages = 400, len(get(method).scheme.substeps)
-    assert abs(volume_error(sol)) <= stages * n_steps * EPS
-    assert symplecticity_defect(sol, relative=True) <= 10 * stages * EPS
 
 
 def test_rk45_and_a_damped_map_do_not():
