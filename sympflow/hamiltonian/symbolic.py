@@ -8,6 +8,7 @@ import re
 import reprlib
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property, partial, reduce
 from itertools import islice
@@ -102,6 +103,8 @@ class SymbolicHamiltonian(Definition):
     parameters: tuple[sp.Symbol, ...] = ()
     values: tuple[float, ...] = ()
     meanings: tuple[sp.Expr, ...] = ()
+    left_out: sp.Expr = sp.S.Zero
+    """The terms of H without coordinates, in its parameters, which a form does not have."""
     _written: tuple[sp.Expr, dict[sp.Symbol, sp.Expr]] | None = None
     """H as it was written, and the values of its parameters; None without any."""
     time: Any = None
@@ -195,7 +198,10 @@ class SymbolicHamiltonian(Definition):
         except (TypeError, OverflowError):  # a value that is no real number
             return self
         states = {*self.q, *self.p}
-        form = self.like(sp.Add(*[term for term in sp.Add.make_args(H) if term.free_symbols & states]))
+        terms = sp.Add.make_args(H)
+        form = self.like(sp.Add(*[term for term in terms if term.free_symbols & states]))
+        constant = sp.Add(*[term for term in terms if not term.free_symbols & states])
+        form.left_out = constant.xreplace({symbol: part for part, (symbol, _) in symbols.found.items()})
         used = form.H.free_symbols - states - {self.time}
         kept = [(part, *symbol) for part, symbol in symbols.found.items() if symbol[0] in used]
         form.meanings, form.parameters, form.values = (tuple(row[i] for row in kept) for i in range(3))
@@ -225,6 +231,28 @@ class SymbolicHamiltonian(Definition):
     def _named(self) -> dict[tuple[str, ...], SymbolicHamiltonian]:
         return {}
 
+    def revalued(self, params: Mapping[str, float]) -> Revalued | None:
+        """The same H with other values of its parameters, by the functions and the code of this one.
+
+        None where H may have another structure with these, which is then to be found anew.
+        """
+        form, (written, before) = self.parametric, self.written
+        if form is self or self.time is not None or self.impulses:
+            return None
+        values = {s: exact(params[s.name]) for s in before}
+        parts, replaced = self.parametric_parts
+        changed = {s for s, value in values.items() if value != before[s]}
+        lasting = [part for part in parts if part not in form.meanings]
+        if changed & replaced or any(part.free_symbols & changed for part in lasting):
+            return None
+        try:
+            numbers = tuple(float(part.xreplace(values)) for part in form.meanings)
+        except (TypeError, OverflowError):  # a value that is no real number
+            return None
+        if any(not math.isfinite(x) or x in (0, 1, -1) for x in numbers):
+            return None
+        return Revalued(self, form, written, values, numbers)
+
     @property
     def written(self) -> tuple[sp.Expr, dict[sp.Symbol, sp.Expr]]:
         """H as it was written, in the numbered coordinates, and the values of its parameters."""
@@ -242,13 +270,18 @@ class SymbolicHamiltonian(Definition):
         return self
 
     @property
+    def structure(self) -> SymbolicHamiltonian:
+        """H with the values with which it was first given: what does not depend on these is asked of it, once."""
+        return self
+
+    @property
     def timed(self) -> bool:  # type: ignore[override]
         return self.time is not None
 
     @cached_property
     def kinetic_timed(self) -> bool:  # type: ignore[override]
         """True if T depends on the time."""
-        return self.T is not None and self.time in self.T.free_symbols
+        return self.time is not None and self.T is not None and self.time in self.T.free_symbols
 
     @cached_property
     def shortest_piece(self) -> float:  # type: ignore[override]
@@ -462,11 +495,90 @@ class SymbolicHamiltonian(Definition):
         self._functions[key] = function
         return function
 
-    _generated = ("_functions", "_switches", "poles")
+    _generated: tuple[str, ...] = ("_functions", "_switches", "poles")
 
     @cached_property
     def _functions(self) -> dict[str, Callable[[Array], Array]]:
         return {}
+
+
+class Revalued(SymbolicHamiltonian):
+    """H with other values of parameters: they are numbers of functions that are generated once for all of them.
+
+    H, V and T with these values are made when they are first asked for, as few runs do.
+    """
+
+    def __init__(
+        self,
+        like: SymbolicHamiltonian,
+        form: SymbolicHamiltonian,
+        written: sp.Expr,
+        values: dict[sp.Symbol, sp.Expr],
+        numbers: tuple[float, ...],
+    ) -> None:
+        self.ndof, self.q, self.p, self.separable = like.ndof, like.q, like.p, like.separable
+        self._root: SymbolicHamiltonian = like.structure
+        self._written = written, values
+        self._form = copy(form)
+        self._form.values, self._form._functions, self._form.inverse_mass = numbers, form._functions, form.inverse_mass
+
+    @property
+    def parametric(self) -> SymbolicHamiltonian:
+        return self._form
+
+    @property
+    def structure(self) -> SymbolicHamiltonian:
+        return self._root
+
+    @cached_property
+    def H(self) -> sp.Expr:
+        written, values = self.written
+        return _with_numeric_constants(_valued(written, values, None))
+
+    @cached_property
+    def _parts(self) -> tuple[Any, Any]:
+        return _split(self.H, self.q, self.p)
+
+    @property
+    def V(self) -> Any:
+        return self._parts[0]
+
+    @property
+    def T(self) -> Any:
+        return self._parts[1]
+
+    @cached_property
+    def inverse_mass(self) -> Any:
+        M = self._form.inverse_mass
+        return M if M is None or not M.free_symbols else M.xreplace(dict(zip(*self._letters, strict=True)))
+
+    @property
+    def _letters(self) -> tuple[Sequence[sp.Symbol], Sequence[sp.Expr]]:
+        return self._form.parameters, [*map(sp.Float, self._form.values)]
+
+    @property
+    def poles(self) -> Poles | None:
+        return self._own_poles if self._root.poles else None
+
+    @cached_property
+    def _own_poles(self) -> Poles:
+        return SymbolicPoles(self)
+
+    @cached_property
+    def _left_out(self) -> float:
+        return float(self._form.left_out.xreplace(self.written[1]))
+
+    def _derivative(self, name: str, order: int) -> Callable[..., Array]:
+        function, numbers = self._form._derivative(name, order), self._form.values
+        constant = self._left_out if order == 0 and name in ("H", "V") else 0.0
+
+        def derivative(x: Array, *t: Array, **_: Any) -> Array:
+            value = function(x, *t, numbers=numbers)
+            return value + constant if constant else value
+
+        return derivative
+
+    _generated = (*SymbolicHamiltonian._generated, "_own_poles")
 
 
 def _single(values: Sequence[Array], like: Array) -> Array:

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from sympflow.hamiltonian.lattice_states import LatticeStates
     from sympflow.hamiltonian.linear_part import LinearPart
     from sympflow.hamiltonian.local import LocalHamiltonian
-    from sympflow.hamiltonian.symbolic import Kick
+    from sympflow.hamiltonian.symbolic import Kick, SymbolicHamiltonian
 
 MOST_DEGREES = 1_000_000
 TYPESET = 400  # characters of an H that notebooks typeset
@@ -363,9 +363,20 @@ class HamiltonianSystem(Hamiltonian, Answering):
                 "times as long as by HamiltonianSystem.lattice, from one site and one bond, or by "
                 "HamiltonianSystem.pairs, from one pair. Use one of these."
             )
+        return cls._of_symbols(symbols, params, settled, damping, period)
+
+    @classmethod
+    def _of_symbols(
+        cls,
+        symbols: SymbolicHamiltonian,
+        params: Mapping[str, Any],
+        scene: Scene,
+        damping: float | ArrayLike | None,
+        period: float | None = None,
+    ) -> HamiltonianSystem:
         self = cls.__new__(cls)
         M = symbols.inverse_mass
-        self._make(symbols, None if M is None else numeric(M), M is not None, params, settled, damping, period)
+        self._make(symbols, None if M is None else numeric(M), M is not None, params, scene, damping, period)
         return self
 
     @classmethod
@@ -850,9 +861,15 @@ class HamiltonianSystem(Hamiltonian, Answering):
         """
         if self.local is not None:
             return HamiltonianSystem._of_local(self.local.with_params(values), self.damping, self.scene)
+        from sympflow.hamiltonian.symbolic import checked_params
+
         self.check_parameters(values)
         H, time = self.symbols.written[0], self.symbols.named_time
         params = {**self.params, **values}
+        checked = checked_params(params)
+        symbols = self.symbols.revalued(checked)
+        if symbols is not None:
+            return HamiltonianSystem._of_symbols(symbols, checked, self.scene, self.damping)
         made = HamiltonianSystem.from_sympy(H, params=params, time=time, damping=self.damping, **vars(self.scene))
         # Values of the drive may have changed the period: it is tested where it is asked for.
         made._former_period = self.period or self._former_period
@@ -948,7 +965,7 @@ class HamiltonianSystem(Hamiltonian, Answering):
 
     @cached_property
     def fingerprint(self) -> tuple[float, ...]:
-        """H at 8 fixed states less H at a ninth, then Γ: what tells a trained flow whether this is its system."""
+        """H at 8 fixed states less H at a ninth, then Γ: a trained flow recognises its system by them."""
         return fingerprint(self)
 
     def __repr__(self) -> str:
@@ -1027,7 +1044,7 @@ COUNTED = {
 
 
 class counting_view:
-    """A view of a system that tells `count` of each evaluation of a force or a derivative of it, not of inner ones."""
+    """A view of a system that calls `count` for each evaluation of a force or a derivative of it, except inner ones."""
 
     def __init__(self, system: HamiltonianSystem, count: Callable[[str, Array], None]) -> None:
         self._system, self._count = system, count

@@ -71,7 +71,7 @@ class SplittingLoops:
             from sympflow.kernels.terms import is_large
 
             self._has_force_gradient = system.quadratic_kinetic
-            self._large = is_large(symbols)
+            self._large = is_large(symbols.structure)
             check_damping(system, self._large)
             if self.driven:
                 from sympflow.kernels.stage_times import driven_form
@@ -84,9 +84,9 @@ class SplittingLoops:
                 self.values, self.traced = self._form.values, True
                 self.abreast = LANES
             else:
-                V = symbols.V
+                V = symbols.structure.V
                 check_recorded(V)
-                check_recorded(symbols.T)
+                check_recorded(symbols.structure.T)
                 self.values = symbols.parametric.values
                 self._has_ranges, self.traced = not self._large, True
                 sums = V is not None and not self._large and V.is_polynomial(*symbols.q)
@@ -183,7 +183,8 @@ class SplittingLoops:
 
             made = term_code(self.splitting(level, monomials, compensated, parametric=False))
         else:
-            from sympflow.kernels.splittings import SplittingCode, shared
+            from sympflow.kernels.rollouts import shared
+            from sympflow.kernels.splittings import SplittingCode
 
             splitting = self.splitting(level, monomials, compensated, ranges or ())
             made = shared(splitting.key, lambda: SplittingCode(splitting))

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from sympflow.kernels.approximations import OnInterval, Ranges
     from sympflow.kernels.stage_times import Driving
 
-__all__ = ["Shape", "Splitting", "SplittingCode", "WithinRange", "shared"]
+__all__ = ["Shape", "Splitting", "SplittingCode", "WithinRange"]
 
 MOST_TABLES = 64  # that are kept
 LONG = 64  # operations of a stage, beyond which products of sums may better be left
@@ -369,20 +369,6 @@ def _kick_changes(
             monomial = monomial * x**n
         changes = [x - e * y for x, y in zip(changes, gradient(monomial, q), strict=True)]
     return changes
-
-
-MOST_CODES = 64  # that are kept, of systems with other structures
-_CODES: dict[Any, Any] = {}
-
-
-def shared(key: Any, make: Callable[[], Any]) -> Any:
-    """Return the code of a key, made once while it is kept: systems are often made again."""
-    found = _CODES.get(key)
-    if found is None:
-        while len(_CODES) >= MOST_CODES:
-            _CODES.pop(next(iter(_CODES)), None)
-        found = _CODES[key] = make()
-    return found
 
 
 class SplittingCode(SplittingRollouts):

@@ -136,7 +136,7 @@ def texts(monkeypatch):
         return compiled(text, *rest)
 
     monkeypatch.setattr("sympflow.kernels.runs.compiled", spy)
-    monkeypatch.setattr("sympflow.kernels.splittings._CODES", {})
+    monkeypatch.setattr("sympflow.kernels.rollouts._CODES", {})
     return found
 
 

@@ -45,7 +45,7 @@ def test_orbits_do_not_depend_on_their_neighbours_nor_on_how_often_they_are_look
     np.testing.assert_array_equal(whole.t_end, np.concatenate([part.t_end for part in parts]))
     full = sympflow.sali(wells, "verlet", (0, 300), y0, dt=0.1, below=0)
     monkeypatch.setattr("sympflow.kernels.tangents.EVERY", 17)
-    monkeypatch.setattr("sympflow.kernels.splittings._CODES", {})
+    monkeypatch.setattr("sympflow.kernels.rollouts._CODES", {})
     again = sympflow.sali(henon_heiles(), "verlet", (0, 300), y0, dt=0.1, below=0)
     np.testing.assert_array_equal(full.value, again.value)
 
