@@ -199,9 +199,7 @@ class KeplerCode(Rollouts):
             if x.error is not None:
                 room.code.store(x.error, place, self.whole + LANES * i)
 
-    def _light(
-        self, room: Room, g: Value, kick: Value, drift: Value, star: Value, vector: Value | None = None
-    ) -> None:
+    def _light(self, room: Room, g: Value, kick: Value, drift: Value, star: Value, vector: Value | None = None) -> None:
         """The same of a group of bodies without mass, which have the same planets inside their orbits."""
         code, light, at = room.code, len(self.light), (g + self.groups) * NUMBERS
         place = code.at(room.state, at)

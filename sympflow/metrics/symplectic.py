@@ -271,11 +271,11 @@ def _form_defect(sol: Solution, rate: float, relative: bool, scale: ArrayLike | 
     for _, h, A in step_tangents(sol):
         n = A.shape[-1] // 2
         felt = _felt(sol.system, n)
-        A = np.where(felt[:, None] | ~felt, A, 0.0)
+        B = np.where(felt[:, None] | ~felt, A, 0.0)
         weights = np.concatenate([np.tile(s, n // d), np.tile(1 / s, n // d)])
         J = np.block([[np.zeros((n, n)), np.eye(n)], [-np.eye(n), np.zeros((n, n))]])
         with np.errstate(all="ignore"):
-            scaled = weights[:, None] * A / weights
+            scaled = weights[:, None] * B / weights
             finite = np.isfinite(scaled).all((-2, -1))
             scaled = np.where(finite[..., None, None], scaled, 0.0)
             kept = J if rate == 0 else np.exp(-rate * h)[..., None, None] * J

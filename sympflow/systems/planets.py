@@ -8,6 +8,7 @@ import numpy as np
 
 from sympflow.hamiltonian.domain import Tube
 from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.systems.celestial import digits
 
 PLANETS = ("Mercury", "Venus", "Earth", "Mars", "Jupiter", "Saturn", "Uranus", "Neptune")
 UNITS = "AU", "day", "solar mass"
@@ -48,9 +49,9 @@ def solar_system(planets: int | Sequence[str] = 8) -> HamiltonianSystem:
 
     Notes
     -----
-    Known truths: the total momentum is 0 and the angular momentum constant; the mean periods are 88.0, 224.7, 365.3, 687,
-    4333, 10 759, 30 685 and 60 189 days. There is neither relativity nor the Moon; with relativity as the `extra` of
-    `HamiltonianSystem.planets` the secular frequencies of the outer planets are those of [2]_ to four digits.
+    Known truths: the total momentum is 0 and the angular momentum constant; the mean periods are 88.0, 224.7, 365.3,
+    687, 4333, 10 759, 30 685 and 60 189 days. There is neither relativity nor the Moon; with relativity as the `extra`
+    of `HamiltonianSystem.planets` the secular frequencies of the outer planets are those of [2]_ to four digits.
 
     The domain is a `Tube` about the ellipses. The default interval is 1,000 years, the default step a twentieth of the
     shortest period.
@@ -89,6 +90,6 @@ def solar_system(planets: int | Sequence[str] = 8) -> HamiltonianSystem:
         elements=elements,
         units=UNITS,
         name="solar_system",
-        domain=Tube(orbit, np.repeat(_THICKNESS * size, 3), groups),
+        domain=Tube(digits(orbit), digits(np.repeat(_THICKNESS * size, 3)), groups),
         t_span=(0.0, 365_250.0),
     )

@@ -46,7 +46,6 @@ def asteroids(**options):
     return HamiltonianSystem.planets([1.0, 1e-3, 3e-4, *[0.0] * 5], elements=LIGHT, G=GAUSS, encounter=None, **options)
 
 
-
 @pytest.mark.parametrize(
     ("method", "system"),
     [

@@ -44,7 +44,7 @@ def test_a_tolerance_chooses_the_step(capsys):
     flow = train(system, tol=1e-6, reach=4, points=100, gradients=0, orbits=300.0, progress=True)
     assert f"Δt {flow.dt:.4g}" in capsys.readouterr().err
     assert flow.figures["energy_error"] <= 1e-6
-    assert 2 * np.pi / 100 < flow.dt <= 2 * np.pi / 10 * 1.001
+    assert 2 * np.pi / 100 < flow.dt <= 2 * np.pi / 4 * 1.001
 
 
 def test_where_it_does_not_hold(flow):
