@@ -81,17 +81,19 @@ def compiled_loops(
 def _followed_loops(make: Callable[[tuple[str, ...]], Any], problem: Problem) -> Any:
     """The compiled loops, that `make` gives for names, of a run through which gradients flow to parameters."""
     names, array = tuple(problem.followed), problem.backend == "array"
+    local = problem.system.local
     try:
         if reason := "`backend` is 'array'." if array else _no_loops_for(problem.y0, problem.system):
             raise NotCompiled(reason)
-        if problem.system.symbols is None:
+        if problem.system.symbols is None and (local is None or local.letters({}) is None):
             raise NotCompiled(f"`system` {problem.system.name!r} is not symbolic.")
         loops = make(names)
         loops.check_reverse()
         return loops.varied(problem.parameter_values)
     except NotCompiled as error:
         raise ValueError(
-            f"`params` has {', '.join(names)}, but no gradient flows to parameters here: {error} Detach them."
+            f"`params` has {', '.join(names) if local is None else 'tensors that require gradients'}, but no gradient "
+            f"flows to parameters here: {error} Detach them."
         ) from error
 
 
