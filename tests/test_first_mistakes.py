@@ -403,6 +403,36 @@ def test_a_tolerance_below_single_precision_is_refused():
         sympflow.solve(sympflow.systems.henon_heiles(), "kahan_li8", (0, 10), tol=1e-9, dtype="float32")
 
 
+LOST = {
+    "driven": ("p**2/2 + sin(q)**2 - 0.3*q*cos(0.9*t)", {"time": "t"}),
+    "damped": ("p**2/2 - cos(q)", {"damping": 0.02}),
+    "both": ("p**2/2 - cos(q) - 0.3*q*cos(0.9*t)", {"time": "t", "damping": 0.05}),
+}
+
+
+@pytest.mark.parametrize("w", [1e-20, 1.0, 1e20])
+@pytest.mark.parametrize("method", ["rk45", "dop853"])
+@pytest.mark.parametrize("t_eval", [None, 50])
+@pytest.mark.parametrize("name", LOST)
+def test_a_tolerance_that_loses_energy_is_doubted_of_driven_and_damped_systems(name, t_eval, method, w):
+    """In units of w of rates, and of s of q and p."""
+    H, scene = LOST[name]
+    H = re.sub(r"\bt\b", "(w*t)", re.sub(r"\b([qp])\b", r"(\1/s)", H))
+    s = w**-0.5
+    scene = scene | ({"damping": scene["damping"] * w} if "damping" in scene else {})
+    system = HamiltonianSystem.from_sympy(f"w*s**2*({H})", params={"w": w, "s": s}, **scene)
+    asked = {} if t_eval is None else {"t_eval": np.linspace(0, 60 / w, t_eval)}
+
+    def run(rtol):
+        return solve(system, method, (0, 60 / w), [1.5 * s, 0.0], rtol=rtol, atol=rtol * s, **asked)
+
+    fine = run(1e-8)  # without a warning, which would be an error
+    with pytest.warns(RuntimeWarning, match=f"`rtol` is too large for method '{method}': the energy of the run is off"):
+        loose = run(0.3)
+    energies = [float(system.hamiltonian(sol.y[:, -1], sol.t[-1])) for sol in (loose, fine)]
+    assert abs(energies[0] - energies[1]) > 0.01 * w * s**2
+
+
 KEPLER = "(p1**2 + p2**2)/2 - 1/sqrt(q1**2 + q2**2)", [0.1, 0, 0, 4.3588989435406735]
 
 

@@ -41,7 +41,7 @@ def systems(ctx: typer.Context, quiet: Quiet = False) -> None:
 def flows(ctx: typer.Context, system: Systems = None, own: Own = None, quiet: Quiet = False) -> None:
     """List the flows that ship, all or those of one system, the cheapest of a system first, with what each achieves.
 
-    The cost is that of a unit of time in force evaluations.
+    The cost is given in force evaluations for a unit of time.
 
     The energy error is relative, the largest up to T: the 95 % quantile over held-out states.
 

@@ -21,7 +21,7 @@ TABLES: dict[str, Table] = {}
 
 
 class Table:
-    """Numbers in a row, known by their values; an argument of operations that is no number itself."""
+    """Numbers in a row, known by their values; an argument of operations, but not a number itself."""
 
     def __init__(self, values: Any) -> None:
         self.values = np.array(values, dtype=np.float64).reshape(-1)

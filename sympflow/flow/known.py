@@ -101,7 +101,7 @@ class KnownFlow:
 
     @property
     def kept_ndof(self) -> int:
-        """The degrees of freedom of the system that the flow is known by, and that its file tells of."""
+        """The degrees of freedom of the system by which the flow is recognised, as its file keeps it."""
         return self.ndof
 
     def matches(self, system: HamiltonianSystem) -> bool:

@@ -84,7 +84,7 @@ class Provenance:
 
     @classmethod
     def of_record(cls, record: dict[str, Any], ndof: int) -> Self:
-        """Return what the record tells, all of it checked."""
+        """Return the provenance of a record, all of it checked."""
         missing = [name for name in FIELDS if name not in record]
         if missing:
             raise Refused(f"its record has no {', '.join(missing)}")

@@ -354,7 +354,7 @@ _ODD = sp.sinh, sp.tanh, sp.asinh, sp.atan, sp.erf, sp.sign
 
 @lru_cache(maxsize=64)
 def places(f: sp.Expr, x: tuple[sp.Symbol, ...]) -> tuple[Place, ...]:
-    """The places where f may be infinite or no number, for all that can be told from it, by letters of x."""
+    """The places where f may be infinite or not a number, as far as they are found, by letters of x."""
     return tuple(place for place in _places(f, x) if _removable(f, place) is None)
 
 

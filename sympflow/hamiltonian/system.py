@@ -965,7 +965,7 @@ class HamiltonianSystem(Hamiltonian, Answering):
 
     @cached_property
     def fingerprint(self) -> tuple[float, ...]:
-        """H at 8 fixed states less H at a ninth, then Γ: what tells a trained flow whether this is its system."""
+        """H at 8 fixed states less H at a ninth, then Γ: a trained flow recognises its system by them."""
         return fingerprint(self)
 
     def __repr__(self) -> str:
@@ -1044,7 +1044,7 @@ COUNTED = {
 
 
 class counting_view:
-    """A view of a system that tells `count` of each evaluation of a force or a derivative of it, not of inner ones."""
+    """A view of a system that calls `count` for each evaluation of a force or a derivative of it, except inner ones."""
 
     def __init__(self, system: HamiltonianSystem, count: Callable[[str, Array], None]) -> None:
         self._system, self._count = system, count

@@ -79,7 +79,7 @@ class Composition(ABC, ArraySteps):
         self.method, self.scheme = method, scheme
 
     def check_system(self, dt: float) -> None:
-        """Raise a ValueError where the friction or the drive of the system asks for shorter steps, or has no flow."""
+        """Raise a ValueError where the friction or the drive of the system needs shorter steps, or has no flow."""
 
     def longest_step(self) -> float:
         """The longest step with which the method is to be used."""

@@ -118,7 +118,7 @@ class Interrupted(KeyboardInterrupt):
 
 @dataclass(frozen=True)
 class Problem:
-    """A validated initial value problem, and the outputs that `solve` asks an integrator for."""
+    """A validated initial value problem, and the outputs that `solve` wants of an integrator."""
 
     system: HamiltonianSystem
     t0: float
@@ -198,7 +198,7 @@ class Integrator:
 
     @property
     def label(self) -> str:
-        """The name in rows and legends, which tells apart what the options make another method."""
+        """The name in rows and legends, which distinguishes methods that differ in options."""
         return self.name
 
     @property

@@ -47,6 +47,7 @@ PHASES, PHASE_ERROR = np.geomspace(1e-3, 3.0, 400), 0.01
 """Where energy is not kept, a step is too long if an oscillation is off by so much of a radian, or beyond the last."""
 LARGE = 200  # degrees of freedom
 FEW_STEPS = 20
+FINER, MOST_FINER = 4, 64  # steps for one of a run, by which it is judged; most of them between two outputs
 MOST_AGAIN = 100  # steps on a clock, which are made again in halves
 SAFE = 4  # steps of so many `dt` of a system are not looked at in a run of few
 FEWEST_NEAR, LOST_DIGITS = 100, 1e-9
@@ -379,7 +380,7 @@ def warn_of_long_steps(outcome: Outcome, integrator: Integrator, problem: Proble
         return
     seen = LOOKED_AT * (not few) if system.ndof <= LARGE else min(LOOKED_AT, n_steps // 200)
     fixed = integrator if isinstance(integrator, FixedStep) and not known else None
-    if not system.keeps_energy:
+    if not system.keeps_energy and dt is not None:
         if (
             fixed
             and n
@@ -391,7 +392,7 @@ def warn_of_long_steps(outcome: Outcome, integrator: Integrator, problem: Proble
         return
     if not n or not seen or system.between_impulses is not system:
         return
-    off = _energy_off(outcome, problem, seen, dt is None)
+    off = _energy_off(outcome, problem, seen, dt is None) if system.keeps_energy else _energy_lost(outcome, problem)
     told = "the energy of the run " + ("overflows" if off == math.inf else f"is off by {100 * off:.2g} %")
     if off <= TOO_LONG and fixed and fixed.in_another_time and n_steps <= MOST_AGAIN:
         off = _end_off(outcome, fixed, problem)
@@ -455,6 +456,39 @@ def _energy_off(outcome: Outcome, problem: Problem, seen: int, each: bool) -> fl
             off = np.fmax(off, np.fmax.reduce(change / known_scale(system, H, sizes), axis=None))
     if np.isfinite(H[0]).all() and np.isinf(change).any():
         return math.inf
+    return float(off) if off < math.inf else 0.0
+
+
+def _energy_lost(outcome: Outcome, problem: Problem) -> float:
+    """The energy that the steps of a driven or damped run lose in all, over its size; 0 if not known.
+
+    It is that of the states at a few outputs and of fine steps from the ones before, times the number of outputs, or
+    of those within the time in which friction forgets.
+    """
+    system, n, width = problem.system, len(outcome.t), 2 * problem.system.ndof
+    y0, t = to_numpy(problem.y0), np.append(problem.t0, outcome.t)
+    y = np.concatenate([y0[None], to_numpy(outcome.y)]).reshape(n + 1, -1, width)[:, :LOOKED_AT].astype(float)
+    t, y = (x[int(t[1] == t[0]) :] for x in (t, y))
+    trajectories = 1 if y0.ndim == 1 else max(1, y0.size // width)
+    parts = FINER * math.ceil(outcome.stats.get("n_steps", 0) / trajectories / max(len(t) - 1, 1))
+    if len(t) < 2 or parts > MOST_FINER or system.ndof > LARGE:
+        return 0.0
+    k = np.unique(np.linspace(0, len(t) - 2, LOOKED_AT // 2).astype(int))
+    h = (t[k + 1] - t[k])[:, None] / parts
+    with np.errstate(all="ignore"):
+        try:
+            fine = y[k]
+            for i in range(parts):
+                fine = fine + h[..., None] * _increment(system, t[k][:, None] + i * h, fine, h)[0]
+            ends = np.broadcast_to(t[k + 1][:, None], fine.shape[:-1])
+            lost = np.mean(system.hamiltonian(y[k + 1], ends) - system.hamiltonian(fine, ends), axis=0)
+            slopes = np.asarray(system.gradient(y[k], np.broadcast_to(t[k][:, None], ends.shape)))
+            size = 0.5 * np.abs(y[k] * slopes)[..., system.ndof :].sum(-1).max(0)  # T: that of a rotor does not grow
+        except (ArithmeticError, ValueError, TypeError):  # a function that takes no batches
+            return 0.0
+        rates = system.friction.rates[system.friction.rates > 0] if system.friction else np.zeros(0)
+        memory = 1 / (rates.min() * np.abs(t[-1] - t[0])) if rates.size else 1.0
+        off = np.fmax.reduce(np.abs(lost) / size) * (len(t) - 1) * min(1.0, memory)
     return float(off) if off < math.inf else 0.0
 
 
@@ -599,13 +633,25 @@ def _tail_states(
     return t, y
 
 
+def _increment(
+    system: HamiltonianSystem, t: np.ndarray, y: np.ndarray, h: np.ndarray, first: np.ndarray | None = None
+) -> tuple[np.ndarray, list[np.ndarray]]:
+    """The mean slope of steps h (...) of DOP853 from states (..., 2d) at t (...), and its slopes; `first` if known."""
+    from scipy.integrate import DOP853
+
+    K = [system.vector_field(y, t) if first is None else first]
+    for c, row in zip(DOP853.C[1:], DOP853.A[1 : len(DOP853.B)], strict=False):
+        stage = y + h[..., None] * sum(a * k for a, k in zip(row, K, strict=False) if a)
+        K.append(system.vector_field(stage, t + c * h))
+    return sum(b * k for b, k in zip(DOP853.B, K, strict=True) if b), K
+
+
 def _end_of_solution(
     system: HamiltonianSystem, t: np.ndarray, y: np.ndarray, end: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Times at which solutions from y (n, 2d) at t (n,) become infinite, or NaN; which reach `end`; which are open."""
     from scipy.integrate import DOP853
 
-    A, B, E3, E5 = DOP853.A, DOP853.B, DOP853.E3, DOP853.E5
     n, d, begin = len(t), system.ndof, t.copy()
     h = (end - t) / 100
     f = system.vector_field(y)
@@ -616,14 +662,13 @@ def _end_of_solution(
         i = np.flatnonzero(running)
         if not len(i):
             break
-        step, K = h[i, None], [f[i]]
-        for row in A[1 : len(B)]:
-            K.append(system.vector_field(y[i] + step * sum(a * k for a, k in zip(row, K, strict=False) if a)))
-        y_new = y[i] + step * sum(b * k for b, k in zip(B, K, strict=True) if b)
+        step = h[i, None]
+        slope, K = _increment(system, t[i], y[i], h[i], f[i])
+        y_new = y[i] + step * slope
         K.append(system.vector_field(y_new))
         scale = RTOL * np.repeat(np.maximum(_sizes(y[i], d), _sizes(y_new, d)), d, axis=1)
         scale[scale == 0] = RTOL
-        e5, e3 = (((step * sum(e * k for e, k in zip(E, K, strict=True))) / scale) for E in (E5, E3))
+        e5, e3 = (((step * sum(e * k for e, k in zip(E, K, strict=True))) / scale) for E in (DOP853.E5, DOP853.E3))
         s5, s3 = (e5**2).mean(-1), (e3**2).mean(-1)
         error = np.where(s5 + s3 == 0, 0.0, s5 / np.sqrt(s5 + 0.01 * s3))
         good = (error <= 1) & np.isfinite(y_new).all(-1) & np.isfinite(K[-1]).all(-1)

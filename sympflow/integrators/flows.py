@@ -163,7 +163,7 @@ class FlowIntegrator(FixedStep):
         raise ValueError(f"`y0` is on {tensor.device}, but the flow is on {flow.device}: move one of them.")
 
     def kernel(self, flow: KnownFlow, problem: Problem) -> Any:
-        """The compiled loops of the flow, or None where the call needs, or asks for, array operations."""
+        """The compiled loops of the flow, or None where the call needs array operations or `backend` chooses them."""
         system = None
         if str(problem.y0.dtype) == "torch.float64":  # for float32 there is another flow
             weights = [*cast(Any, flow).parameters()]

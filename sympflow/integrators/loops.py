@@ -48,7 +48,7 @@ def compiled_loops(
     told: list[str] | None = None,
     system: Any = None,
 ) -> Any:
-    """Return the compiled loops that `make` gives, or None where the call needs, or asks for, array operations.
+    """Return the compiled loops that `make` gives, or None where array operations are needed or chosen.
 
     Tensors need these, except on the CPU where the `system` is given.
     """

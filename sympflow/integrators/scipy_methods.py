@@ -209,7 +209,7 @@ class _Scipy(RungeKutta):
         return outcome
 
     def steps(self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array) -> Steps:
-        """The realised steps. In a batch the trajectories advance in parallel; one that has ended waits with h = 0."""
+        """The realised steps. Trajectories of a batch advance in parallel; those that have ended get h = 0."""
         y, going = np.array(y0, dtype=float), np.full(y0.shape[:-1], t_span[0] != t_span[1]).reshape(-1)
         for piece in pieces_of(self, system, *t_span):
             y = yield from self._steps(system, piece, y, going)

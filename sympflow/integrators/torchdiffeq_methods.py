@@ -69,7 +69,7 @@ class Trace:
         return self.t_span[0] + self.direction * s.double()
 
     def evaluated(self, y: Any, f: Any) -> None:
-        """Called with the slope f at each state y where torchdiffeq asks for it."""
+        """Called with the slope f at each state y where torchdiffeq evaluates it."""
 
     def array(self, x: Any) -> Array:
         """A tensor of torchdiffeq's as what the user gave."""

@@ -96,7 +96,7 @@ class Trajectories(Shown):
             NaN marks a value that is missing. Points without any value are left out. A trajectory whose times all
             descend is turned around.
         ndof : int, optional
-            Degrees of freedom d; else read off the data. With it a table's columns may bear any names, in this `order`.
+            Degrees of freedom d; else read off the data. With it a table's columns may have any names, in this `order`.
         order : {"halves", "pairs"} or sequence of int
             The order of the rows of y, or of columns whose names are not those of coordinates: q1 … qd, p1 … pd; q1,
             p1, q2, p2, …; or the places of q1 … qd, p1 … pd.

@@ -102,7 +102,7 @@ def lyapunov(
 
     As t grows it tends to the exponent of the orbit, for almost all initial vectors [1]_ [2]_: to a positive number on
     a chaotic one, and like ln(t)/t to 0 on a regular one, so that a value of that size at the end of the run does not
-    tell the two apart (`sali` does). With friction the exponent of an orbit that comes to rest is negative.
+    distinguish the two (`sali` does). With friction the exponent of an orbit that comes to rest is negative.
 
     Parameters
     ----------
