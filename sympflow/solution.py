@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from sympflow.arguments import check_flag, told, warn
+from sympflow.arguments import check_flag, warn
 from sympflow.arrays import Array, concatenate, is_tensor, to_numpy
 from sympflow.hamiltonian.scales import known_scale, size_of_terms, weights
 from sympflow.integrators.contract import method_text
@@ -241,7 +241,6 @@ class Solution(Answering):
     def preview(self) -> Figure | None:
         return self.plot() if len(self.t) and not isinstance(self, StoredSolution) else None
 
-    @told
     def plot(self, kinds: Sequence[str] = KINDS, path: str | os.PathLike[str] | None = None) -> Figure:
         """Draw the orbit, the phase plane and the energy error over time, of 16 trajectories of a batch at most.
 

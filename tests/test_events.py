@@ -15,6 +15,7 @@ from sympflow.integrators.interpolants import Interpolant, Piecewise
 from sympflow.integrators.tableaux import ADAPTIVE as TORCHDIFFEQ_ADAPTIVE
 from sympflow.kernels.explicit_loops import compiled_field
 
+pytestmark = pytest.mark.filterwarnings("ignore:`dt` .* is too long:RuntimeWarning")
 OSCILLATOR, HH = systems.harmonic_oscillator(), systems.henon_heiles()
 ADAPTIVE = ["rk45", "dop853", *TORCHDIFFEQ_ADAPTIVE]
 MULTISTEP = ["explicit_adams", "implicit_adams"]

@@ -9,6 +9,7 @@ import pytest
 import sympflow
 from sympflow import HamiltonianSystem, solve
 
+pytestmark = pytest.mark.filterwarnings("ignore:`dt` .* is too long:RuntimeWarning")
 LAM = np.array([0.3, 0.0, 0.7, 0.3])
 
 

@@ -124,6 +124,11 @@ class CallableHamiltonian(Definition):
     def identity_parts(self) -> Any:
         return [self.ndof, self._functions] if self.timed else [self.ndof, *self._functions]
 
+    @property
+    def name(self) -> str:
+        letter, name = "V" if self._name == "potential" else "H", getattr(self._given_function, "__name__", "")
+        return f"{letter} = {name}" if name.isidentifier() else f"{letter} of a function"
+
     def place(self, y0: Any, domain: Any, inverse_mass: np.ndarray | None, t_span: tuple[float, float]) -> None:
         self._scene = y0, domain, inverse_mass, t_span
 

@@ -59,6 +59,11 @@ class Definition:
     instead: str = "an implicit method such as 'gauss_legendre6', or a Runge–Kutta method"
     _generated: tuple[str, ...] = ("_functions",)  # what cannot be pickled, and is made again
 
+    @property
+    def name(self) -> str:
+        """The name of a system to which none was given."""
+        return ""
+
     def __getstate__(self) -> dict[str, Any]:
         return {name: value for name, value in vars(self).items() if name not in self._generated}
 

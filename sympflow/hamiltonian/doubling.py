@@ -130,7 +130,7 @@ def doubled(
         raise TypeError(f"`system` {system.name!r} is of a doubling: add the forces, and double what was doubled.")
     if force is None and system.conservative:
         raise TypeError("`force` is needed: a system without friction is Hamiltonian as it is.")
-    named = f"{system.name}_doubled" if name is None else name
+    named = (system.scene.name and f"{system.name}_doubled") if name is None else name
     scene: dict[str, Any] = {"name": named, "t_span": system.t_span, "dt": system.dt}
     scene["domain"] = _thin_box(system) if domain is None else domain
     scene["energy_scale"] = _energy_scale(system)
@@ -164,8 +164,7 @@ def doubled(
         time = None if system.symbols.time is None else {"time": system.symbols.time, "period": system.period}
         made = DoubledSystem.from_sympy(doubled_hamiltonian(system, F), **scene, **(time or {}))  # type: ignore[assignment]
     made.physical = system if force is None else system.with_force(F)
-    made.y0 = None if system.y0 is None else made.lift(system.y0)
-    return made
+    return made if system.y0 is None else made.with_scene(y0=made.lift(system.y0))  # type: ignore[return-value]
 
 
 class GivenForce:

@@ -56,6 +56,7 @@ from sympflow.hamiltonian.jumps import (
 from sympflow.hamiltonian.poles import Poles, SymbolicPoles
 from sympflow.hamiltonian.recorded import recorded
 from sympflow.hamiltonian.removable import BOUNDED, Max, sinc
+from sympflow.show.cards import cut
 
 LARGEST, TINY = sys.float_info.max, 1e-150
 MOST_LEFT_OUT = 100  # degrees of freedom up to the last one that a formula may do without
@@ -230,6 +231,10 @@ class SymbolicHamiltonian(Definition):
     @cached_property
     def _named(self) -> dict[tuple[str, ...], SymbolicHamiltonian]:
         return {}
+
+    @cached_property
+    def name(self) -> str:
+        return cut(f"H = {self.written[0]}", 60)
 
     def revalued(self, params: Mapping[str, float]) -> Revalued | None:
         """The same H with other values of its parameters, by the functions and the code of this one.
@@ -591,6 +596,7 @@ def _square(values: Sequence[Array], like: Array) -> Array:
     return flat.reshape(*flat.shape[:-1], n, n)
 
 
+VELOCITY_LIKE = re.compile(r"(d(q|x|y|z|r|theta|phi)|\w+_?dot|qd)\d*")
 COORDINATE_LIKE = re.compile(r"[pqv]?[xyzr]\d?|[PQX]\d*|v|[pq]_?\w|[vpq]?_?(theta|phi)\d?")
 """Names of parameters that are coordinates elsewhere."""
 
@@ -703,6 +709,11 @@ def _valued(H: sp.Expr, values: Mapping[sp.Symbol, sp.Expr], time: sp.Symbol | N
             meant += (
                 " Coordinates are q and p, or q1 … qd and p1 … pd: other names are given by "
                 "from_sympy(H, q=['x', 'y'], p=['px', 'py'])."
+            )
+        if velocity := next((name for name in unknown if VELOCITY_LIKE.fullmatch(name)), ""):
+            meant += (
+                f" H is a function of momenta: if {velocity} is a velocity q', write p, which is ∂L/∂q', such as m*q',"
+                " in its place."
             )
         raise ValueError(f"`expression` holds {', '.join(shown)} without a value: give it in `params`.{meant}")
     return H

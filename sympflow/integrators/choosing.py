@@ -68,7 +68,7 @@ def choose_method(
             refused = refused or error
             continue
         return integrator, reason
-    raise refused or ValueError(f"`system` {system.called} has no method that applies: pass `method`.")
+    raise refused or ValueError(f"`system` {system.name!r} has no method that applies: pass `method`.")
 
 
 def _candidates(

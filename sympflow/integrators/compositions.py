@@ -150,12 +150,12 @@ class KineticPotential(Composition):
         self.method, self.scheme, self.system = method, scheme, system
         if not system.separable:
             raise ValueError(
-                f"`method` {method!r} needs a separable system, H = T(p) + V(q), and {system.called} is not: use "
+                f"`method` {method!r} needs a separable system, H = T(p) + V(q), and {system.name!r} is not: use "
                 f"{system.definition.instead}."
             )
         if (scheme.nystrom or scheme.level) and not system.quadratic_kinetic:
             raise ValueError(
-                f"`method` {method!r} needs a kinetic energy ½ pᵀM⁻¹p, which {system.called} does not have: use a "
+                f"`method` {method!r} needs a kinetic energy ½ pᵀM⁻¹p, which {system.name!r} does not have: use a "
                 "scheme for any separable system, such as 'kahan_li8'."
             )
         system.check_damped_drifts()
@@ -397,7 +397,7 @@ class LinearRest(ExactMaps):
         if scheme.nystrom and any(part.turns for part in self.parts.rest):
             raise ValueError(
                 f"`method` {method!r} has a Nyström scheme, which needs a rest of H that is a potential U(q), and that "
-                f"of {system.called} depends on p too: use 'linear_kahan_li6', 'linear_aba864' or 'impulse'."
+                f"of {system.name!r} depends on p too: use 'linear_kahan_li6', 'linear_aba864' or 'impulse'."
             )
         if scheme.level > FORCE_GRADIENT:
             raise ValueError(
@@ -569,7 +569,7 @@ class KeplerInteraction(Composition):
         frame = frame_of(system)
         if frame is None:
             raise ValueError(
-                f"`method` {method!r} is for planets about a star, which {system.called} is not: make it by "
+                f"`method` {method!r} is for planets about a star, which {system.name!r} is not: make it by "
                 "HamiltonianSystem.planets, or take the splitting 'kinetic', such as 'srkn11b'."
             )
         frame.check(method)

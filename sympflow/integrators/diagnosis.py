@@ -42,9 +42,11 @@ ACROSS, AROUND, PARTS = 0.25, 8, 9
 """A step leaps if, at one of so many points on it, what vanishes is so small a part of what it is at another; around it
 H changes by more than a tenth of the kinetic energy within so many steps."""
 LOST_AROUND = 0.1
-TOO_LONG = 0.05  # energy error, over the size of the energy, of a run whose step is too long
-PHASES, PHASE_ERROR = np.geomspace(1e-3, 3.0, 400), 0.01
-"""Where energy is not kept, a step is too long if an oscillation is off by so much of a radian, or beyond the last."""
+TOO_LONG = 0.01
+"""The energy error, over the size of the energy, from which a step is too long: that of Verlet's method at a tenth of
+its stability. Where energy is not kept, the error of an oscillation as fast as the motion."""
+TOO_LOOSE = 0.05  # the same, of adaptive methods, and of the end of a run on a clock
+PHASES = np.geomspace(1e-3, 3.0, 400)  # oscillations, in radians a step; beyond the last one none is followed
 LARGE = 200  # degrees of freedom
 FEW_STEPS = 20
 FINER, MOST_FINER = 4, 64  # steps for one of a run, by which it is judged; most of them between two outputs
@@ -360,7 +362,7 @@ def _end(
 
 
 def warn_of_long_steps(outcome: Outcome, integrator: Integrator, problem: Problem) -> None:
-    """Warn of what a method doubts, and of steps with which the energy is off by `TOO_LONG` of its size.
+    """Warn of what a method doubts, and of steps with which the energy is off by more than 1 % of its size.
 
     Where energy is not kept, the motion at the start and the end must not be too fast for the step. On a clock the
     energy may be kept although the time is wrong: a run of few steps is compared with one in halves.
@@ -392,12 +394,16 @@ def warn_of_long_steps(outcome: Outcome, integrator: Integrator, problem: Proble
         return
     if not n or not seen or system.between_impulses is not system:
         return
-    off = _energy_off(outcome, problem, seen, dt is None) if system.keeps_energy else _energy_lost(outcome, problem)
+    most = TOO_LOOSE if dt is None else TOO_LONG
+    if system.keeps_energy:
+        off = _energy_off(outcome, problem, seen, most, dt is None)
+    else:
+        off = _energy_lost(outcome, problem)
     told = "the energy of the run " + ("overflows" if off == math.inf else f"is off by {100 * off:.2g} %")
-    if off <= TOO_LONG and fixed and fixed.in_another_time and n_steps <= MOST_AGAIN:
-        off = _end_off(outcome, fixed, problem)
+    if off <= most and fixed and fixed.in_another_time and n_steps <= MOST_AGAIN:
+        off, most = _end_off(outcome, fixed, problem), TOO_LOOSE
         told = f"with half of it the run ends {100 * off:.2g} % of its size away"
-    if off > TOO_LONG:
+    if off > most:
         what, remedy = "`rtol` is too large", "Take rtol=1e-8, or a method of fixed steps with tol=1e-6"
         if dt is not None:
             what, remedy = f"`dt` {dt:g} is too long", "Take a shorter step, or tol=1e-6, which chooses one"
@@ -422,7 +428,7 @@ def try_steps(integrator: Integrator, system: HamiltonianSystem, t_span: tuple[f
             warn_of_long_steps(outcome, integrator, piece)
 
 
-def _energy_off(outcome: Outcome, problem: Problem, seen: int, each: bool) -> float:
+def _energy_off(outcome: Outcome, problem: Problem, seen: int, most: float, each: bool) -> float:
     """The largest change of H at the start and some outputs, over its size, at `each` or at most; 0 if not known."""
     system, n, width = problem.system, len(outcome.t), 2 * problem.system.ndof
     every = slice((n - 1) % (step := -(-n // seen)), None, step)  # the last among them
@@ -442,17 +448,17 @@ def _energy_off(outcome: Outcome, problem: Problem, seen: int, each: bool) -> fl
     with np.errstate(all="ignore"):
         try:
             H = np.asarray(functions.hamiltonian(y, **numbers))
-            if (H.max(0) - H.min(0) <= TOO_LONG * np.abs(H[0])).all():
+            if (H.max(0) - H.min(0) <= most * np.abs(H[0])).all():
                 return 0.0
             change = np.abs(H - H[0])
-            if not (change > TOO_LONG * np.abs(H[0])).any():
+            if not (change > most * np.abs(H[0])).any():
                 return 0.0
             sizes = 0.5 * np.abs(y * np.asarray(functions.gradient(y, **numbers))).sum(-1)
             size = sizes if each else sizes.max(0)
         except (ArithmeticError, ValueError, TypeError):  # a function that takes no batches
             return 0.0
         off = np.fmax.reduce(change / np.maximum(size, system.energy_scale or 0.0), axis=None)  # of a rest 0/0
-        if off > TOO_LONG:  # told as the energy error of the run
+        if off > most:  # told as the energy error of the run
             off = np.fmax(off, np.fmax.reduce(change / known_scale(system, H, sizes), axis=None))
     if np.isfinite(H[0]).all() and np.isinf(change).any():
         return math.inf
@@ -508,7 +514,7 @@ def _too_fast(outcome: Outcome, integrator: FixedStep, problem: Problem) -> str:
     times, ends = [problem.t0, float(outcome.t[-1])], [to_numpy(y) for y in (problem.y0, outcome.y[-1])]
     rate = rate_of_motion(problem.system.between_impulses, times, ends)
     dt = integrator.step_length(problem.system)
-    if not _misses(integrator, np.array([dt * rate])).any():
+    if not rate or not _misses(integrator, np.array([dt * rate])).any():
         return ""
     most = float(PHASES[_misses(integrator, PHASES)][0])
     return (
@@ -520,8 +526,9 @@ def _too_fast(outcome: Outcome, integrator: FixedStep, problem: Problem) -> str:
 
 def _misses(integrator: FixedStep, z: np.ndarray) -> np.ndarray:
     """True for oscillations of z radians in a step that a method does not follow, (n,)."""
-    error = np.abs(integrator.multiplier(z) - np.exp(1j * z))
-    return (error > PHASE_ERROR * z) | ((error > 0) & (z >= PHASES[-1]))
+    with np.errstate(all="ignore"):
+        error = integrator.oscillation_error(z)
+    return (error > TOO_LONG) | ((error > 0) & (z >= PHASES[-1]))
 
 
 def note_singularities(outcome: Outcome, integrator: Integrator, problem: Problem, told: bool = False) -> None:

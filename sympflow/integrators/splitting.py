@@ -229,10 +229,10 @@ class Splitting(FixedStep):
         plain = self.splitting == "kinetic" and self.clock == "physical" and not self.overrides("step")
         return self.scheme if plain else None
 
-    def multiplier(self, z: np.ndarray) -> np.ndarray:
+    def oscillation_error(self, z: np.ndarray) -> np.ndarray:
         scheme = self.kicks_and_drifts
         if scheme is None or scheme.level == POLYNOMIAL:
-            return super().multiplier(z)
+            return super().oscillation_error(z)
         q, p, x = np.array([1 + 0 * z, 0 * z]), np.array([0 * z, 1 + 0 * z]), z**2  # q and hp of two orbits
         for kind, b, g, c, *_ in scheme.substeps:
             if kind == "drift":
@@ -241,7 +241,11 @@ class Splitting(FixedStep):
                 p = p - (b * x - g * x**2 + c * x**3) * q
         half_trace = (q[0] + p[1]) / 2
         root = np.emath.sqrt(half_trace**2 - 1)
-        return half_trace + np.where(np.sin(z) < 0, -root, root)
+        multiplier = half_trace + np.where(np.sin(z) < 0, -root, root)
+        # A step keeps an ellipse in (zq, hp), on which the energy, half the squared radius, changes.
+        mean, half_change = (z * q[1] - p[0] / z) / 2, np.hypot(z * q[1] + p[0] / z, p[1] - q[0]) / 2
+        swing = np.where(mean > half_change, 2 * half_change / (mean - half_change), np.inf)
+        return np.maximum(np.abs(multiplier - np.exp(1j * z)) / z, swing)
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
         """Count those of a scheme of kicks and drifts; a stepper counts those of other parts too."""

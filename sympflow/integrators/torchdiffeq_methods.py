@@ -529,11 +529,11 @@ class FixedGrid(ExplicitStep, FixedStep):
         make = partial(self.compiled, problem.system, "explicit_kernel", self.tableau)
         return stepper_of(self, problem, OwnSteps(self, problem), make)
 
-    def multiplier(self, z: np.ndarray) -> np.ndarray:
+    def oscillation_error(self, z: np.ndarray) -> np.ndarray:
         K: list[np.ndarray] = []
         for row in self.A[: len(self.B)]:
             K.append(1j * z * (1 + (weighted(row, K) if K else 0.0)))
-        return 1 + weighted(self.B, K)
+        return np.abs(1 + weighted(self.B, K) - np.exp(1j * z)) / z
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
         return {"force_evaluations": len(self.B) * (n_steps + n_extra), "hessian_evaluations": 0}

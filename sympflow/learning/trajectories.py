@@ -18,7 +18,7 @@ from sympflow.flow.scaling import Scaling
 from sympflow.learning import reading
 from sympflow.learning.reading import OBSERVED, Run
 from sympflow.learning.smoothing import Smooth, smoothed
-from sympflow.show.cards import Card, Shown
+from sympflow.show.cards import Answering, Card
 from sympflow.show.pictures import MOST_LINES, trajectory_figure
 from sympflow.show.style import saved
 from sympflow.storage.layout import imported
@@ -40,7 +40,7 @@ ANGLES = {"2*np.pi": 2 * np.pi, "360": 360.0}  # periods of angles that are look
 
 
 @dataclass(frozen=True, repr=False)
-class Trajectories(Shown):
+class Trajectories(Answering):
     """Trajectories of one system, from which it is learned; made by `Trajectories.read`.
 
     Attributes

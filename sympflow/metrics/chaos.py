@@ -256,7 +256,7 @@ def gali(
     check_counts(k=k)
     if not 2 <= k <= 2 * system.ndof:
         raise ValueError(
-            f"`k` must be from 2 to {2 * system.ndof}, the dimension of the phase space of {system.called}; got {k}."
+            f"`k` must be from 2 to {2 * system.ndof}, the dimension of the phase space of {system.name!r}; got {k}."
         )
     return indicator(orbits, int(k), VOLUME, checked_threshold(below), t_eval, deviations, seed, backend)
 

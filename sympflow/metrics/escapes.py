@@ -125,7 +125,7 @@ def region_of(outside: Any, system: HamiltonianSystem) -> Outside:
     if outside is None:
         if system.domain is None:
             raise ValueError(
-                f"`outside` is needed, as {system.called} has no domain: pass a radius, a domain or a function."
+                f"`outside` is needed, as {system.name!r} has no domain: pass a radius, a domain or a function."
             )
         outside = system.domain
     if real_number(outside):

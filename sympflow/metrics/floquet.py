@@ -121,7 +121,7 @@ def floquet_multipliers(
     system = given_system(system)
     T = system.period if period is None else period
     if T is None:
-        raise ValueError(f"`period` is needed: the system {system.called} has none of its own.")
+        raise ValueError(f"`period` is needed: the system {system.name!r} has none of its own.")
     check_positive("period", T)
     checked_number("t0", t0)
     check_array(y0, "multipliers are of NumPy arrays")

@@ -297,7 +297,7 @@ def _domain_for(system: HamiltonianSystem, domain: Domain | None) -> Domain:
         domain = _around_orbit(system)
     if domain is None:
         raise ValueError(
-            f"`domain` is not known for the system {system.called}: pass the states to train on, as by "
+            f"`domain` is not known for the system {system.name!r}: pass the states to train on, as by "
             f"domain={remedy_for(system)}."
         )
     if not isinstance(domain, Domain):
@@ -395,7 +395,7 @@ def _meant(system: HamiltonianSystem, options: dict[str, Any], searches: bool) -
     if searched and not suitable:
         raise ValueError(
             f"`{searched[0]}` is of the search for primed flows by Gauss–Newton, which needs H = ½ pᵀM⁻¹p + V(q); "
-            f"{system.called} is of another form: leave it out for a network, or pass kind='primed', optimizer='bfgs'."
+            f"{system.name!r} is of another form: leave it out for a network, or pass kind='primed', optimizer='bfgs'."
         )
     if searched or any(name in fits.OF_PRIMED for name in options):
         return "primed"
@@ -412,13 +412,13 @@ def _check_primable(system: HamiltonianSystem, given: list[str], searches: bool)
     needs = f"{named} asks for a flow primed with V and T"
     if not system.separable:
         raise ValueError(
-            f"{needs}, but the system {system.called} has one function H, not known as T(p) + V(q): leave out {named} "
+            f"{needs}, but the system {system.name!r} has one function H, not known as T(p) + V(q): leave out {named} "
             "for a network, or define the system with HamiltonianSystem.from_sympy."
         )
     if not system.quadratic_kinetic and searches:
         raise ValueError(
             f"{needs}, whose table Gauss–Newton fits only where T = ½ pᵀM⁻¹p, as it is not in the system "
-            f"{system.called}: leave out {named} for a network, or pass optimizer='bfgs'."
+            f"{system.name!r}: leave out {named} for a network, or pass optimizer='bfgs'."
         )
 
 

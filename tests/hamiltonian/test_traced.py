@@ -425,7 +425,7 @@ def test_a_sum_in_one_function_is_separable_as_it_is_by_text(name):
 
 def test_what_is_no_sum_stays_one_function():
     product = HamiltonianSystem(hamiltonian=lambda q, p: (p**2).sum(-1) * (1 + (q**2).sum(-1)), ndof=2, y0=Y0)
-    with pytest.raises(ValueError, match="'custom' is not: use an implicit method"):
+    with pytest.raises(ValueError, match="'H of a function' is not: use an implicit method"):
         solve(product, "verlet", (0, 1))
     assert solve(product, "tao4", (0, 1), dt=0.1).stats["backend"] == "compiled"
 

@@ -66,7 +66,8 @@ def test_the_contract_of_integrators():
     """A star with heavy companions, whose momenta are of the size of the differences that the checks make."""
     orbits = {"a": [1.5, 9.0], "e": [0.1, 0.05], "inc": [0.02, 0.04], "M": [0.0, 2.0]}
     system = HamiltonianSystem.planets([2.0, 0.5, 0.4], elements=orbits, t_span=(0, 60.0), dt=0.3, encounter=None)
-    system.domain = sympflow.Tube(solve(system, "srkn11b", (0, 300.0), dt=0.05, save_every=20).y.T, 0.02)
+    around = solve(system, "srkn11b", (0, 300.0), dt=0.05, save_every=20).y.T
+    system = system.with_scene(domain=sympflow.Tube(around, 0.02))
     report = check_integrator(sympflow.get("wisdom_holman"), system)
     assert set(report.skipped) == {"friction_is_in_the_steps", "the_drive_is_in_the_steps"}
 
