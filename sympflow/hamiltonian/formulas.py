@@ -130,7 +130,7 @@ class TracedHamiltonian:
             return
         if kinetic is None:
             M = np.ones(ndof) if inverse_mass is None else inverse_mass
-            rows: list[list[Any]] = (np.diag(M) if M.ndim == 1 else M).tolist()
+            rows: list[list[Any]] = [[*row] for row in (np.diag(M) if M.ndim == 1 else M).astype(object)]
             self.inverse_mass = Entries(rows)
             kinetic = traced(lambda *p: [_kinetic(rows, p)], *(s.name for s in self.p))
         self.T = Formula(kinetic, self.p)
