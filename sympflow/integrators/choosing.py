@@ -215,8 +215,9 @@ def choose_step(
     tol : float
         The largest error: |H − H₀| relative to the `energy_scale` of `sympflow.metrics.energy`. Where H is not
         conserved, with friction or a drive, the error of the balance of energy and work takes its place: the sum of
-        the differences of H from short runs with half of the step, each from a state of the run. Where H is kept whatever the step, as by Gauss methods on a quadratic H, and for the methods on the
-        logarithmic clock, the error is that of the states; also of a driven H that jumps in t.
+        the differences of H from short runs with half of the step, each from a state of the run. Where H is kept
+        whatever the step, as by Gauss methods on a quadratic H, and for the methods on the logarithmic clock, the error
+        is that of the states; also of a driven H that jumps in t.
     y0 : array_like of shape (..., 2d), optional
         Initial states, by default the system's.
     t_span : (float, float), optional
