@@ -9,6 +9,7 @@ import warnings
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import partial
+from types import NoneType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -293,8 +294,9 @@ def solve(
 def _moving_times(t_span: Any, t_eval: Any) -> Any:
     """The times that torch follows, where there are some."""
     ends = t_span if isinstance(t_span, (tuple, list)) else ()
-    listed = [t for t in t_eval if type(t) is not float] if isinstance(t_eval, (tuple, list)) else (t_eval,)
-    if not differentiable(*ends, *listed):
+    listed = t_eval if isinstance(t_eval, (tuple, list)) else (t_eval,)
+    times = [t for t in (*ends, *listed) if type(t) not in (float, int, NoneType)]
+    if not times or not differentiable(*times):
         return None
     from sympflow.integrators.tensors import MovingTimes
 
@@ -447,7 +449,8 @@ def _solved(integrator: Integrator, problem: Problem, action: str, rows: Paramet
         t_events=None if problem.events is None else problem.events.times(),
         y_events=None if problem.events is None else problem.events.states(y_start),
     )
-    if isinstance(sol, StoredSolution):
+    if problem.store is not None:
+        assert isinstance(sol, StoredSolution)
         sol.store, sol.t, sol.y = problem.store, None, None
     if stopped is not None:
         raise Interrupted(outcome, sol) from None

@@ -139,7 +139,8 @@ class LocalHamiltonian(Definition, ABC):
         """∇²V(q), dense: (..., d) to (..., d, d)."""
         d = self.ndof
         self.check_dense(np.prod(q.shape, dtype=float) * d, "∇²V")
-        return self.hessian_vector(q[..., None, :], like(np.eye(d), q) + 0 * q[..., None, :], *t)
+        columns = self.hessian_vector(q[..., None, :], like(np.eye(d), q) + 0 * q[..., None, :], *t)
+        return columns.swapaxes(-1, -2)  # not symmetric where bodies without mass feel others
 
     def check_dense(self, entries: float, what: str) -> None:
         """Refuse a matrix with more than 5e7 entries: ∇²V, or that of the equations of an implicit step."""

@@ -313,7 +313,7 @@ class SymbolicHamiltonian(Definition):
         return [*jumping, *touches(self.H, self.time, self.samples)]
 
     def jump_times(self, low: float, high: float, step: float, kinks: bool = False) -> np.ndarray:
-        found = [samples.jump_times(low, high) for samples in self.samples.values()]
+        found = [samples.jump_times(low, high, kinks) for samples in self.samples.values()]
         found += [each.times(low, high, step, kinks) for each in self._switches]
         times = np.unique(np.concatenate(found)) if found else np.zeros(0)
         return times[np.diff(times, prepend=-np.inf) > 8 * sys.float_info.epsilon * np.abs(times)]

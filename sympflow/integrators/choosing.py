@@ -81,10 +81,10 @@ def _candidates(
     if "rtol" in options or "atol" in options:
         yield "dop853", "`rtol` and `atol` are given"
         return
-    if flows and "dt" not in options and _flow_holds(system, y0, tol):
-        yield "sympflow", "a trained flow ships for this system, and y0 is in its domain"
     if system.local is not None and system.local.frame is not None and system.local.frame.crossing() is None:
         yield "wisdom_holman", "planets move about a star"
+    if flows and "dt" not in options and _flow_holds(system, y0, tol):
+        yield "sympflow", "a trained flow ships for this system, and y0 is in its domain"
     place, steep = "", False
     if plain and y0.dtype == np.float64 and system.separable and system.keeps_energy:
         place, steep = _attractive_pole(system, y0.reshape(-1, y0.shape[-1])[:MOST_STATES].tobytes())

@@ -12,7 +12,7 @@ import numpy as np
 
 from sympflow.compiler import NotCompiled
 from sympflow.compiler.control import Value
-from sympflow.compiler.machine import address
+from sympflow.compiler.machine import address, given
 from sympflow.kernels.protocol import Batch
 from sympflow.kernels.runs import BLOCK, Memory, Numbers, Room, Values, map_function, reverse_function, run_function
 from sympflow.kernels.threads import NEVER
@@ -194,7 +194,7 @@ class Rollouts(ABC):
         if self.room is not None:
             work = aligned((3 * self.n_values + self.room) * width)
             arguments = *arguments, self.n_values, self.n_out if n_out is None else n_out, work, self._places
-        self.function(name, width)(*[address(x) if isinstance(x, np.ndarray) else x for x in arguments])
+        self.function(name, width)(*given(arguments))
 
     def run(self, table: Any, batch: Batch, closed: bool = True) -> None:
         """Run the rows of a batch in the lanes of registers; those that end early once more, alone, to find where."""
