@@ -271,8 +271,7 @@ def rows_of(
     name: str, scene: Scene, options: argparse.Namespace, quick: dict[str, Any], done: list[Row]
 ) -> Iterator[Row]:
     """The rows of a system that are not done, by its flows that ship, or others."""
-    system = scene.make()
-    system.name = name
+    system = scene.make().with_scene(name=name)
     if options.fit:
         starts = scene.starts[: 1 if options.quick else None]
         flows = [fitted(system, start, tables, options.flows, **quick) for start, tables in starts]

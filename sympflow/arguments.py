@@ -15,6 +15,7 @@ from contextlib import contextmanager
 from functools import wraps
 from math import isfinite
 from pathlib import Path
+from types import FunctionType
 from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
@@ -352,6 +353,7 @@ INSTEAD = {
     **dict.fromkeys(("n_jobs", "n_workers", "num_workers"), "sympflow.ensemble has `workers`"),
     "dt": "steps to try are `steps`, and a method with one step is sympflow.get(name)(dt=...)",
     "tol": "the step for a tolerance is that of sympflow.choose_step(system, method, tol)",
+    "budget": "how long is `repeats`, the number of timed runs",
     "plane": "the plane of a section is `coordinate` = `level`",
     "E": "the energy of a section is `energy`",
     "device": "pass `y0` as a tensor on that device",
@@ -384,30 +386,46 @@ def told(function: Callable[P, T]) -> Callable[P, T]:
     return call
 
 
+def told_of_all(cls: type[T]) -> type[T]:
+    """Decorate a class so that its constructors and its public methods are `told`."""
+    for name, value in vars(cls).copy().items():
+        if name.startswith("_") and name != "__init__":
+            continue
+        if isinstance(value, classmethod):
+            setattr(cls, name, classmethod(told(value.__func__)))
+        elif isinstance(value, FunctionType):
+            setattr(cls, name, told(value))
+    return cls
+
+
 def _misfit(function: Callable[..., Any], given: int, options: dict[str, Any]) -> str:
     """The message for a call with so many arguments and these options, which the function does not take."""
-    parameters = inspect.signature(function).parameters
-    named = [p for p in parameters.values() if p.name != "self" and p.kind is not p.VAR_KEYWORD]
-    names, what = [p.name for p in named], f"{function.__name__}()"
-    more = any(p.kind is p.VAR_KEYWORD for p in parameters.values())
-    unknown = [] if more else [name for name in options if name not in parameters]
+    parameters = list(inspect.signature(function).parameters.values())
+    *_, owner, name = ["", *function.__qualname__.split(".")]
+    bound = bool(parameters) and parameters[0].name in ("self", "cls")
+    parameters, given = parameters[bound:], given - bound
+    call = owner if name == "__init__" else name
+    named = [p for p in parameters if p.kind is not p.VAR_KEYWORD]
+    names, more = [p.name for p in named], len(named) < len(parameters)
+    ordered = [p.name for p in named if p.kind is p.POSITIONAL_OR_KEYWORD]
+    missing = [p for p in named if p.default is p.empty and p.name not in (*options, *ordered[:given])]
+    meant = [p.name for p in missing] if more else names
+    unknown = [each for each in options if each not in names and (not more or closest(each, meant))]
     if unknown:
-        remedy = advice(unknown[0], names) or "remove it."
+        remedy = advice(unknown[0], meant) or "remove it."
         if function.__module__.startswith("sympflow.systems"):
             remedy = "pass it to solve()." if unknown[0] in OF_RUNS else closest(unknown[0], names) and remedy
             remedy = remedy or "write your own H with it, by HamiltonianSystem.from_sympy."
-        return f"`{unknown[0]}` is not an argument of {what}, which takes {', '.join(names) or 'none'}: {remedy}"
-    ordered = [p.name for p in named if p.kind is p.POSITIONAL_OR_KEYWORD]
-    given -= "self" in parameters
+        return f"`{unknown[0]}` is not an argument of {call}(), which takes {', '.join(names) or 'none'}: {remedy}"
     if given > len(ordered):
         rest = [*names[len(ordered) :], *["name"] * more]
         if not rest:
-            return f"`{function.__name__}` takes {', '.join(names) or 'no arguments'}: leave the others out."
+            return f"`{call}` takes {', '.join(names) or 'no arguments'}: leave the others out."
         after = f" after `{ordered[-1]}`" if ordered else ""
-        return f"arguments of {what}{after} are given by name: write {rest[0]}=value."
-    missing = [p.name for p in named if p.default is p.empty and p.name not in (*options, *ordered[:given])]
+        return f"arguments of {call}(){after} are given by name: write {rest[0]}=value."
     if missing:
-        return f"`{missing[0]}` is missing: give it, {function.__name__}({', '.join(ordered or missing)})."
+        by_name = [f"{p.name}=…" for p in missing if p.kind is p.KEYWORD_ONLY]
+        return f"`{missing[0].name}` is missing: give it, {call}({', '.join([*ordered, *by_name])})."
     return f"`{next(name for name in options if name in ordered)}` is given twice, by place and by name: name it once."
 
 

@@ -112,7 +112,7 @@ def assemble(values: Sequence[Any], like: Array) -> Array:
 
         # numbers, and what depends on the time alone, are the same for all of a batch
         full = [v + torch.zeros_like(like) if is_number(v) or v.ndim < like.ndim else v for v in values]
-        return torch.stack(full, dim=-1)
+        return torch.stack(full, dim=-1).to(like.dtype)
     out = np.empty((*np.shape(like), len(values)), dtype=like.dtype)
     for i, value in enumerate(values):
         out[..., i] = value
@@ -141,9 +141,14 @@ def to_numpy(x: Array) -> np.ndarray:
     return found
 
 
+def learnable(*arrays: Any) -> bool:
+    """Return True if torch could follow one of these tensors, were gradients enabled."""
+    return any(x.requires_grad or _is_transformed(x) for x in filter(is_tensor, arrays))
+
+
 def differentiable(*arrays: Any) -> bool:
     """Return True if torch follows one of these tensors, by any means: NumPy would silently drop what it follows."""
-    return any(map(_is_followed, filter(is_tensor, arrays)))
+    return learnable(*arrays) and (_keeps_graphs() or transformed(*arrays))
 
 
 def values(x: Any) -> np.ndarray | None:
@@ -202,7 +207,7 @@ def lanes(x: Array) -> int:
 
 def readable(x: Array) -> bool:
     """Return True if the values of `x` are there, one for each entry: not under vmap, nor where a graph is traced."""
-    if not is_tensor(x) or _is_plain(x):
+    if _is_plain(x):
         return True
     plain, order = _behind(x)
     return plain is not None and len(order) == x.ndim
@@ -216,7 +221,9 @@ def untransformed() -> AbstractContextManager[Any]:
 
 
 def _is_plain(x: Any) -> bool:
-    """True of a tensor that stands for itself alone, as nearly all do."""
+    """True of an array, and of a tensor that stands for itself alone, as nearly all do."""
+    if not is_tensor(x):
+        return True
     import torch
 
     alone = torch._C._functorch.peek_interpreter_stack() is None  # else a function of x would be wrapped
@@ -243,13 +250,13 @@ def _behind(x: Any) -> tuple[Any, Sequence[int]]:
 
 def transformed(*arrays: Any) -> bool:
     """Return True if torch follows one of these tensors by other means than a graph for reverse mode."""
-    return any(is_tensor(x) and _is_transformed(x) for x in arrays)
+    return any(map(_is_transformed, filter(is_tensor, arrays)))
 
 
-def _is_followed(x: Any) -> bool:
+def _keeps_graphs() -> bool:
     import torch
 
-    return bool(x.requires_grad and torch.is_grad_enabled()) or _is_transformed(x)
+    return torch.is_grad_enabled()
 
 
 def _is_transformed(x: Any) -> bool:

@@ -51,7 +51,7 @@ class Event:
 
 
 def parse(events: Any) -> tuple[Event, ...]:
-    """Events from a function or a list of functions that may bear `terminal`, True or a count, and `direction`."""
+    """Events from functions with optional attributes `terminal`, True or a count, and `direction`."""
     if events is None:
         return ()
     functions = (events,) if callable(events) else events

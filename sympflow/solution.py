@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from sympflow.arguments import check_flag, told, warn
+from sympflow.arguments import check_flag, warn
 from sympflow.arrays import Array, concatenate, is_tensor, to_numpy
 from sympflow.hamiltonian.scales import known_scale, size_of_terms, weights
 from sympflow.integrators.contract import method_text
@@ -177,7 +177,7 @@ class Solution(Answering):
         Raises
         ------
         ValueError
-            If the system is no doubled one.
+            If the system is not doubled.
 
         Warns
         -----
@@ -241,7 +241,6 @@ class Solution(Answering):
     def preview(self) -> Figure | None:
         return self.plot() if len(self.t) and not isinstance(self, StoredSolution) else None
 
-    @told
     def plot(self, kinds: Sequence[str] = KINDS, path: str | os.PathLike[str] | None = None) -> Figure:
         """Draw the orbit, the phase plane and the energy error over time, of 16 trajectories of a batch at most.
 
@@ -301,7 +300,7 @@ class Solution(Answering):
         )
 
     def to_xarray(self, energy: bool = True) -> xarray.Dataset:
-        """The solution as an `xarray.Dataset`, from which `to_netcdf` and `to_zarr` of xarray write files.
+        """The solution as an `xarray.Dataset`; its `to_netcdf` and `to_zarr` write files.
 
         Variables are `q` and `p` with the dimensions (..., dof, time), `energy` (..., time), the initial states `q0`
         and `p0` (..., dof), `status` (...), and of each event i its times `t_event_i` and states. A batch has the

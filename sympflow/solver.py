@@ -6,9 +6,10 @@ import math
 import os
 import time
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import partial
+from types import NoneType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -30,6 +31,7 @@ from sympflow.arrays import (
     differentiable,
     finite_states,
     full_of_nan,
+    is_tensor,
     known_finite,
     lanes,
     last,
@@ -41,7 +43,7 @@ from sympflow.integrators.choosing import check_tolerance, choose_method, state_
 from sympflow.integrators.contract import Failure, Integrator, Interrupted, Outcome, Problem
 from sympflow.integrators.diagnosis import diagnose, diagnose_piece, note_poles, note_singularities_of_rows
 from sympflow.integrators.domain_exit import check_domain, check_system_along
-from sympflow.integrators.grid import MOST_OPEN_STEPS, no_event
+from sympflow.integrators.grid import MOST_OPEN_STEPS, Grid, no_event
 from sympflow.integrators.grid_runs import report_lanes
 from sympflow.integrators.impulses import landings, run_in_pieces
 from sympflow.integrators.problems import (
@@ -62,7 +64,8 @@ if TYPE_CHECKING:
     from sympflow.hamiltonian.parameter_rows import ParameterRows
     from sympflow.storage.runs import RunStore
 
-COMPARED = 16  # outputs of a run with a chosen step, at most, at which it is compared with one of half the step
+COMPARED = {"state": 16, "energy": 256}
+"""Outputs of a run with a chosen step, at most, at which it is compared with one of half the step."""
 FIRST_WINDOW = 4096  # steps of the first of the ever longer runs to an infinite end
 
 
@@ -96,7 +99,8 @@ def solve(
     Parameters
     ----------
     system : HamiltonianSystem
-        Or the name of a scene, such as "henon-heiles", or H as a formula, such as "p**2/2 + q**4/4".
+        Or the name of a scene, such as "henon-heiles", H as a formula, such as "p**2/2 + q**4/4", or a system in a
+        file of your own, "own.py:name" or "own.toml".
     method : str, Integrator, or trained flow, optional
         A name from `sympflow.available()`; or a configured integrator such as ``get("verlet")(dt=0.05)``; or a flow. By
         default one that suits the system, the first of these that applies: a flow that ships for it ("sympflow");
@@ -115,8 +119,9 @@ def solve(
         The largest relative energy error that is asked for; on the logarithmic clock, which may keep H where the time
         is wrong, the error of states. A method of fixed steps takes the step that `sympflow.choose_step` finds by short
         trial runs; for "sympflow" it chooses the flow, see its option. The error of the run itself is in `stats`,
-        "energy_error" or "state_error": where it is larger, a RuntimeWarning and the message say so. That of states,
-        or with friction or a drive, is found by another run with half of the step.
+        "energy_error" or "state_error": where it is larger, a RuntimeWarning and the message say so. That of states
+        is found by another run with half of the step; with friction or a drive the energy is balanced with the work,
+        which is that of runs with half of the step from one output to the next.
     tol_of : {"energy", "state"}
         See `sympflow.choose_step`.
     params : mapping of str to array_like, optional
@@ -212,8 +217,8 @@ def solve(
     if moving is not None:
         if events is not None or dense_output or store is not None or params is not None:
             raise ValueError(
-                "`t_span` or `t_eval` requires gradients, which flow through no `events`, `dense_output`, `store` or "
-                "`params`: pass `.detach()`, or leave these out; of values for all trajectories make the system, by "
+                "`t_span` or `t_eval` requires gradients, which do not flow through `events`, `dense_output`, `store` "
+                "or `params`: pass `.detach()`, or leave these out; of values for all trajectories make the system, by "
                 "system.with_params(...)."
             )
         t_span, t_eval = moving.numbers
@@ -290,8 +295,9 @@ def solve(
 def _moving_times(t_span: Any, t_eval: Any) -> Any:
     """The times that torch follows, where there are some."""
     ends = t_span if isinstance(t_span, (tuple, list)) else ()
-    listed = [t for t in t_eval if type(t) is not float] if isinstance(t_eval, (tuple, list)) else (t_eval,)
-    if not differentiable(*ends, *listed):
+    listed = t_eval if isinstance(t_eval, (tuple, list)) else (t_eval,)
+    times = [t for t in (*ends, *listed) if type(t) not in (float, int, NoneType)]
+    if not times or not differentiable(*times):
         return None
     from sympflow.integrators.tensors import MovingTimes
 
@@ -350,21 +356,34 @@ def _check_tolerance_met(
 def _change_by_halves(
     sol: Solution, integrator: Integrator, problem: Problem, rows: ParameterRows | None, tol_of: str
 ) -> np.ndarray:
-    """The differences of states, or of H, at some outputs from a run with half of the step."""
-    few = slice((len(sol.t) - 1) % (every := -(-len(sol.t) // COMPARED)), None, every)  # with the last
+    """The differences of states at some outputs from a run with half of the step, or the error of the energy's balance.
+
+    This is the sum of the differences of H from runs between the outputs, each from the state before: orbits of chaos
+    part without any error.
+    """
+    few = slice((len(sol.t) - 1) % (every := -(-len(sol.t) // COMPARED[tol_of])), None, every)  # with the last
     half: Any = replace(integrator, dt=0.5 * integrator.dt)  # type: ignore[attr-defined, type-var]
     y0, times = problem.y0 if rows is not None else to_numpy(problem.y0), sol.t[few]
-    alike = replace(problem, y0=y0, t1=float(times[-1]), t_eval=times, save_every=1, dense_output=False, events=None)
-    try:
-        finer = _answered(half, replace(alike, diagnosed=False), "ignore", rows)
-    except Interrupted as stop:
-        raise Interrupted(stop.outcome, sol) from None
-    n = len(finer.t)
+    states = to_numpy(sol.states)[..., few, :]
+
+    def finer(start: Array, t0: float, ends: np.ndarray) -> Solution:
+        alike = replace(problem, y0=start, t0=t0, t1=float(ends[-1]), t_eval=ends, save_every=1, dense_output=False)
+        try:
+            return _answered(half, replace(alike, events=None, diagnosed=False), "ignore", rows)
+        except Interrupted as stop:
+            raise Interrupted(stop.outcome, sol) from None
+
     if tol_of == "energy":
-        H = to_numpy(sol.energy())[..., few][..., :n]
-        return (H - to_numpy(finer.energy())) / sol.energy_scale()[..., None]
-    change = to_numpy(sol.states)[..., few, :][..., :n, :] - to_numpy(finer.states)
-    return state_error(sol.system, to_numpy(y0), change)
+        H, off = to_numpy(sol.energy())[..., few], np.zeros((*states.shape[:-2], len(times)))
+        for k in range(len(times)):
+            start, t0 = (states[..., k - 1, :], float(times[k - 1])) if k else (y0, problem.t0)
+            ended = finer(start, t0, times[k : k + 1])
+            if not len(ended.t):
+                return off[..., :k] / sol.energy_scale()[..., None]
+            off[..., k] = off[..., k - 1] + H[..., k] - to_numpy(ended.energy())[..., 0]
+        return off / sol.energy_scale()[..., None]
+    whole = finer(y0, problem.t0, times)
+    return state_error(sol.system, to_numpy(y0), states[..., : len(whole.t), :] - to_numpy(whole.states))
 
 
 def _answered(integrator: Integrator, problem: Problem, action: str, rows: ParameterRows | None) -> Solution:
@@ -387,11 +406,15 @@ def _solved(integrator: Integrator, problem: Problem, action: str, rows: Paramet
     check_applies(integrator, between, y_start)
     integrator.check_library(y_start)
     run: Callable[[Integrator, Problem], tuple[Outcome, Problem]] = _run
-    able = problem.store is None and problem.parameter_values is None
-    told, jumps = landings(integrator, between, problem.t0, problem.t1, able, kinks=rows is None)
+    able = problem.store is None and (rows is None or problem.parameter_values is None or _alike_in_time(problem, rows))
+    driven = between if rows is None or problem.parameter_values is None else rows.system_of(0).between_impulses
+    told, jumps = landings(integrator, driven, problem.t0, problem.t1, able)
     if told:
-        without = "a `store`" if problem.store is not None else "gradients by `params`, and with `t_eval`"
-        warn(told if able else f"{told} Without {without}, steps end at jumps.", RuntimeWarning)
+        without = "Without a `store`" if problem.store is not None else "With one value of `params` at a time"
+        warn(told if able else f"{told} {without}, steps end there.", RuntimeWarning)
+    if jumps and rows is not None and problem.t_eval is None and (length := integrator.step_length(between)):
+        outputs = Grid(problem.t0, problem.t1, length).outputs(None, problem.save_every)
+        problem = replace(problem, t_eval=outputs)  # the same of all trajectories
     if between is not system:
         _check_impulses(problem, integrator)
     if between is not system or jumps:
@@ -427,7 +450,8 @@ def _solved(integrator: Integrator, problem: Problem, action: str, rows: Paramet
         t_events=None if problem.events is None else problem.events.times(),
         y_events=None if problem.events is None else problem.events.states(y_start),
     )
-    if isinstance(sol, StoredSolution):
+    if problem.store is not None:
+        assert isinstance(sol, StoredSolution)
         sol.store, sol.t, sol.y = problem.store, None, None
     if stopped is not None:
         raise Interrupted(outcome, sol) from None
@@ -438,39 +462,51 @@ def _solved_followed(integrator: Integrator, problem: Problem, action: str, rows
     """The solution of trajectories to whose parameters gradients flow: one run, whatever the values."""
     numbers = {name: as_tensor(value.copy()) for name, value in rows.values.items() if name not in rows.followed}
     followed = {name: rows.followed[name] if name in rows.followed else numbers[name] for name in rows.values}
-    parameter_values = np.array([np.ravel(value) for value in rows.values.values()])
+    letters = None if problem.system.local is None else problem.system.local.letters(followed)
+    if letters is not None:
+        followed = {name: x if is_tensor(x) else as_tensor(np.array(x)) for name, x in letters.items()}
+    columns = [np.broadcast_to(to_numpy(value), rows.shape) for value in followed.values()]
+    parameter_values = np.array([np.ravel(value) for value in columns])
     together = replace(problem, parameter_values=parameter_values, followed=followed, diagnosed=False)
     if problem.system.between_impulses is not problem.system or problem.events is not None or action == "stop":
         raise ValueError(
-            f"`params` has {', '.join(rows.followed)} that require gradients, which flow through no `events`, "
+            f"`params` has {', '.join(rows.followed)} that require gradients, which do not flow through `events`, "
             "impulses, or `on_domain_exit` 'stop': detach them, or leave these out."
         )
     integrator.check_followed(together)
-    _check_jumps_stay(problem, rows)
+    if (name := _moving(problem, rows, rows.followed)) is not None:
+        raise ValueError(
+            f"`params` has {name} that requires gradients and moves the times at which H jumps in t, which "
+            "gradients do not follow: detach it, or make the jump smooth, such as (1 + tanh((t - c)/w))/2."
+        )
     sol = _solved(integrator, together, action, rows)
     sol.rows = rows
     return sol
 
 
-def _check_jumps_stay(problem: Problem, rows: ParameterRows) -> None:
-    """Refuse gradients by parameters that move jumps of H in t: they would lack what the jumps contribute."""
+def _alike_in_time(problem: Problem, rows: ParameterRows) -> bool:
+    """Return True if H jumps, and has its kinks, at the same times for all trajectories."""
+    varied = [name for name, value in rows.values.items() if np.ptp(value) > 0]
+    return _moving(problem, rows, varied, kinks=True) is None
+
+
+def _moving(problem: Problem, rows: ParameterRows, names: Iterable[str], kinks: bool = False) -> str | None:
+    """The first of some parameters that moves the times at which H jumps in t, or has `kinks`."""
     system = problem.system
     if not system.definition.may_jump:
-        return
+        return None
 
-    def jumps(values: dict[str, float]) -> np.ndarray:
+    def times(values: dict[str, float]) -> np.ndarray:
         between = system.with_params(**values)
-        return between.jump_times(min(problem.t0, problem.t1), max(problem.t0, problem.t1), between.dt / 4)
+        return between.jump_times(min(problem.t0, problem.t1), max(problem.t0, problem.t1), between.dt / 4, kinks)
 
     for place in (0, -1):
         values = {name: float(np.ravel(value)[place]) for name, value in rows.values.items()}
-        for name in rows.followed:
+        for name in names:
             near = values | {name: values[name] + 1e-6 * (abs(values[name]) or 1.0)}
-            if not np.array_equal(jumps(values), jumps(near)):
-                raise ValueError(
-                    f"`params` has {name} that requires gradients and moves the times at which H jumps in t, which "
-                    "gradients do not follow: detach it, or make the jump smooth, such as (1 + tanh((t - c)/w))/2."
-                )
+            if not np.array_equal(times(values), times(near)):
+                return name
+    return None
 
 
 def _solved_rows(integrator: Integrator, problem: Problem, action: str, rows: ParameterRows) -> Solution:
@@ -627,7 +663,7 @@ def _fits(outcome: Outcome, y0: Array) -> bool:
 
 
 def _check_outcome(outcome: Any, integrator: Integrator, y0: Array) -> None:
-    """Refuse what is no answer (of a plug-in), and flag states that are not finite, whatever the method says."""
+    """Refuse an invalid answer of a plug-in, and flag states that are not finite, whatever the method says."""
     if not (isinstance(outcome, Outcome) and _fits(outcome, y0)):
         what = type(outcome).__name__
         if isinstance(outcome, Outcome):

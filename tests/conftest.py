@@ -29,11 +29,17 @@ LOW_ORDER = {"adaptive_heun", "bosh3", "fehlberg2"}
 """Methods that choose thousands of steps where `dopri5`, of the same kind, needs ten."""
 
 
-def pytest_collection_modifyitems(items):
+COLLECTED = pytest.StashKey[set[str]]()
+"""Names of all tests and rows that there are, whether they run or not."""
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(config, items):
     """Mark as slow LOW_ORDER, and what long.txt lists.
 
     These are rows of some seconds whose kind a shorter row shows, and without brackets a few tests that take several.
     """
+    config.stash[COLLECTED] = {item.nodeid for item in items}
     listed = set((TESTS / "long.txt").read_text("utf-8").splitlines())
     for item in items:
         row = item.callspec.params.values() if hasattr(item, "callspec") else ()

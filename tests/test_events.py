@@ -7,7 +7,6 @@ import tracemalloc
 import numpy as np
 import pytest
 import torch
-from conftest import KINDS
 from scipy.integrate import solve_ivp
 
 from sympflow import HamiltonianSystem, SympFlow, get, solve, systems
@@ -16,6 +15,7 @@ from sympflow.integrators.interpolants import Interpolant, Piecewise
 from sympflow.integrators.tableaux import ADAPTIVE as TORCHDIFFEQ_ADAPTIVE
 from sympflow.kernels.explicit_loops import compiled_field
 
+pytestmark = pytest.mark.filterwarnings("ignore:`dt` .* is too long:RuntimeWarning")
 OSCILLATOR, HH = systems.harmonic_oscillator(), systems.henon_heiles()
 ADAPTIVE = ["rk45", "dop853", *TORCHDIFFEQ_ADAPTIVE]
 MULTISTEP = ["explicit_adams", "implicit_adams"]
@@ -80,12 +80,6 @@ class TestEveryMethod:
             np.testing.assert_allclose(sol.sol(sol.t[-1]), sol.y[:, -1], atol=64 * EPS)
             assert (sol.status, sol.success, sol.message) == (1, True, "A termination event occurred.")
             assert (np.diff(sol.t) * np.sign(t_end) > 0).all()
-
-    def test_the_run_is_the_one_without_events(self, method):
-        times = np.linspace(0, 5, 7)
-        with_events = solve(HH, method, (0, 5), t_eval=times, events=zero_q, **options(method))
-        without = solve(HH, method, (0, 5), t_eval=times, **options(method))
-        np.testing.assert_allclose(with_events.y, without.y, atol=1e3 * EPS)
 
     def test_output_times_beyond_a_terminal_event_are_dropped(self, method):
         at_one = event(lambda t, y: t - 1.0, terminal=True)
@@ -188,30 +182,8 @@ def test_a_zero_between_the_samples_of_a_flow_is_found(rotation):
     np.testing.assert_allclose(sol.t_events[0], np.pi * (np.arange(20) + 0.5) / 7, atol=1e-12)
 
 
-@pytest.mark.parametrize("method", KINDS)
-@pytest.mark.parametrize("t_end", [8.0, -8.0])
-@pytest.mark.filterwarnings("ignore:`dt` .* is too long")
-def test_the_state_of_an_event_is_the_dense_output_there(method, t_end):
-    """For every kind of method; without end and with one."""
-    if method == "mlp" and t_end < 0:
-        return  # it has no inverse, so no backward time
-    for terminal in (None, 2):
-        g = event(lambda t, y: y[0] - 0.05, terminal=terminal)
-        sol = solve(HH, method, (0, t_end), events=g, dense_output=True, on_domain_exit="ignore", **loose(method))
-        assert sol.status == (0 if terminal is None else 1)
-        check_states_of_events(sol)
-
-
 def loose(method):
     return {"rtol": 1e-4, "atol": 1e-6} if method in ADAPTIVE else {}
-
-
-def check_states_of_events(sol):
-    assert sol.t_events[0].size >= 2
-    np.testing.assert_allclose(sol.sol(sol.t_events[0]).T, sol.y_events[0], rtol=0, atol=256 * EPS)
-    for t, y in zip(sol.t_events[0], sol.y_events[0], strict=True):
-        np.testing.assert_allclose(sol.sol(t), y, rtol=0, atol=256 * EPS)
-        assert abs(y[0] - 0.05) < 256 * EPS
 
 
 def test_events_of_tensors():

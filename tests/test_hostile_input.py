@@ -224,9 +224,9 @@ ARGUMENTS = {
     "shift enormous": ({"shift": 1e300}, ValueError, "`shift` must be a finite number"),
     "shift below the energy": ({"shift": -1e9}, ValueError, r"`shift` -1e\+09 does not exceed"),
     "flow a number": ({"flow": 3}, TypeError, "`flow` must be a trained flow"),
-    "flow a file's name": ({"flow": "f.safetensors"}, ValueError, "`flow` 'f.safetensors' is the name of no flow"),
+    "flow a file's name": ({"flow": "f.safetensors"}, ValueError, "`flow` 'f.safetensors' does not name a flow"),
     "tol NaN": ({"tol": math.nan}, ValueError, "`tol` must be a positive number"),
-    "tol out of reach": ({"tol": 1e-300}, ValueError, "`tol` 1e-300 is (met by no flow|not met)"),
+    "tol out of reach": ({"tol": 1e-300}, ValueError, "`tol` 1e-300 is not met"),
 }
 OPTIONS = {name for method in METHODS for name in get(method).options()}
 

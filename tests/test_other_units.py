@@ -97,28 +97,6 @@ def test_methods(method):
         assert told[0] == [] or (method, told[0]) == ("euler", [True])
 
 
-@pytest.mark.parametrize(
-    ("method", "form"),
-    [
-        ("verlet", "well"),
-        ("chin4a", "kepler"),
-        ("gauss_legendre4", "kepler"),
-        ("gauss_legendre8", "bent"),
-        ("tao4", "bent"),
-    ],
-)
-def test_compiled_methods(method, form):
-    def end(system, units):
-        sol = solve(system, method, t_eval=[system.t_span[1]])
-        assert sol.stats["backend"] == "compiled"
-        assert sol.success, sol.message
-        return sol.y[:, -1] / of_states(form, units)
-
-    expected = end(scaled(form), (1.0, 1.0, 1.0))
-    for units in (UNITS[0], UNITS[2]):
-        np.testing.assert_allclose(end(scaled(form, units), units), expected, rtol=0, atol=1e-9)
-
-
 def run(system, method="verlet", n=40):
     method = method if system.separable else "implicit_midpoint"
     t = np.linspace(0.0, 2 * system.t_span[1], n + 1)
@@ -299,7 +277,7 @@ def test_the_earth_is_back_after_a_year(two_bodies, method, backend):
 
 
 def test_copies_that_part_are_told_in_any_units(two_bodies):
-    apart, long = "two copies that method 'tao2' keeps differ by", "`dt` .* is too long"
+    apart, long = "two copies that method 'tao2' keeps differ by .* change `omega`", "`dt` .* is too long"
     with pytest.warns(RuntimeWarning, match=apart), pytest.warns(RuntimeWarning, match=long):
         solve(two_bodies, "tao2", dt=YEAR / 4, omega=1e-3 / YEAR, backend="array")
 

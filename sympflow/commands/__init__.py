@@ -28,7 +28,7 @@ class Command(TyperCommand):
 
 
 app = typer.Typer(no_args_is_help=True, rich_markup_mode="rich", pretty_exceptions_enable=False)
-app.command(cls=Command)(listings.systems)
+app.command(cls=Command, context_settings=PARAMETERS)(listings.systems)
 app.command(cls=Command)(listings.methods)
 app.command(cls=Command, context_settings=PARAMETERS)(listings.flows)
 app.command(cls=Command, context_settings=PARAMETERS)(running.solve)

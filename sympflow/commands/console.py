@@ -44,6 +44,7 @@ PHRASES: dict[str, str | Callable[[re.Match[str]], str]] = {
     r"flows from other files are read by sympflow\.load": "flows from other files are named by their path",
     r"pass the states to train on, as by domain=sympflow\.Box.*?\(energy, box\)": "define the system with one, under "
     "[domain] of a .toml file for instance",
+    r"Join q and p along the last axis, np\.concatenate\(\[q, p\], axis=-1\)": "Give all q and then all p, with commas",
     r"Pass the states themselves": "Give --batch 0",
     r"flow\.certificate\(system\)": "`sympflow certificate`",
     r'damping="quadratic"': "`--drag`",

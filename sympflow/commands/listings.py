@@ -15,33 +15,45 @@ if TYPE_CHECKING:
     from sympflow.integrators.contract import Integrator
 
 
-def systems(ctx: typer.Context, quiet: Quiet = False) -> None:
-    """List the systems, those of plug-ins too, their parameters and the flows that ship for them."""
+def systems(ctx: typer.Context, system: Systems = None, own: Own = None, quiet: Quiet = False) -> None:
+    """List the systems, those of plug-ins too, their parameters and the flows that ship for them, or show one.
+
+    Examples:
+
+      sympflow systems
+
+      sympflow systems henon-heiles
+    """
     with reporting(ctx):
         from sympflow.flow.shipped import shipped_flows
 
+        if system or own:
+            scene = one_scene(system, own).system
+            ships = ", ".join(flow.name for flow in shipped_flows(scene)) or "none"
+            out.print(scene.card().plain(), f"  trained flows: {ships}", sep="\n", markup=False)
+            return
         rows = []
         for name in scene_names():
             try:
-                system = made(name)
+                scene = made(name)
             except Exception as error:  # of a plug-in, which must not take all others with it
                 rows.append((name, str(error), "", "", "", ""))
                 continue
-            flows = shipped_flows(system)
+            flows = shipped_flows(scene)
             primed = sum(f.stages is not None for f in flows)
             trained = [f"{f.kind} (Δt = {f.dt:g})" for f in flows if f.stages is None]
             trained += [f"{primed} primed"] if primed else []
-            formula = textwrap.shorten(str(system.symbols.H), 72, placeholder=" …") if system.symbols else ""
+            formula = textwrap.shorten(str(scene.symbols.H), 72, placeholder=" …") if scene.symbols else ""
             params = ", ".join(f"{k} = {shown(v)}" for k, v in parameters(name).items()) or "–"
-            span = f"{system.t_span[0]:g} … {system.t_span[1]:g}"
-            rows.append((name, formula, params, span, f"{system.dt:g}", ", ".join(trained) or "–"))
+            span = f"{scene.t_span[0]:g} … {scene.t_span[1]:g}"
+            rows.append((name, formula, params, span, f"{scene.dt:g}", ", ".join(trained) or "–"))
         print_table(("name", "H", "parameters", "interval", "step", "trained flows"), rows)
 
 
 def flows(ctx: typer.Context, system: Systems = None, own: Own = None, quiet: Quiet = False) -> None:
     """List the flows that ship, all or those of one system, the cheapest of a system first, with what each achieves.
 
-    The cost is that of a unit of time in force evaluations.
+    The cost is given in force evaluations for a unit of time.
 
     The energy error is relative, the largest up to T: the 95 % quantile over held-out states.
 

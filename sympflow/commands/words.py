@@ -25,15 +25,13 @@ from sympflow.integrators.registry import build
 from sympflow.systems import SYSTEMS, harmonic_oscillator
 from sympflow.systems import available as available_systems
 from sympflow.systems import get as system_named
+from sympflow.systems.given import FILE
 from sympflow.systems.user_files import factory as file_factory
 
 Text = str | None
 Number = float | None
 Count = int | None
 File = Path | None
-
-FILE = re.compile(r"(?P<path>.+?\.(?:py|toml))(?::(?P<rest>.*))?", re.DOTALL)
-"""A system in a file: file.toml, file.py:name, and parameters behind them."""
 
 
 class Usage(ValueError):

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 from sympflow.compiler.functions import FUNCTIONS, apply
 from sympflow.compiler.numbers import Number
 from sympflow.compiler.program import Program, Recording, Traced
+from sympflow.compiler.tables import Table
 
 __all__ = ["Arranged", "Arrangement"]
 
@@ -119,8 +120,8 @@ class Arrangement:
 
     # polynomials --------------------------------------------------------------------------------------------------
 
-    def number(self, x: Any) -> Polynomial:
-        return x if isinstance(x, Polynomial) else Polynomial(self, {(): float(x)} if x != 0 else {})
+    def number(self, x: Any) -> Any:
+        return x if isinstance(x, Polynomial | Table) else Polynomial(self, {(): float(x)} if x != 0 else {})
 
     def letter(self, node: Any) -> Polynomial:
         """A number of the body as a polynomial."""
@@ -255,9 +256,9 @@ class Arrangement:
         (((order, _),),) = x.terms
         return self._nodes[order]
 
-    def written(self, x: Polynomial | float) -> Any:
+    def written(self, x: Polynomial | Table | float) -> Any:
         """Write a polynomial into the body, with a short chain, and return its number; that of a constant is itself."""
-        return x if isinstance(x, float) else self._plan(x.terms).write()
+        return x if isinstance(x, float | Table) else self._plan(x.terms).write()
 
     def moved(self, base: Any, factor: Any, x: Any) -> Any:
         """base + factor·x, of numbers of the body, with the shortest chain.

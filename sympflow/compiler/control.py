@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 from sympflow.compiler.numbers import Number
+from sympflow.compiler.tables import TABLES, Table
 
 __all__ = [
     "BOOL",
@@ -306,6 +307,8 @@ class Code:
 
     def apply(self, name: str, args: Sequence[Any]) -> Value:
         """Write a function of the table; operands that are floats become constants."""
+        if isinstance(args[0], Table):
+            return LOWERED[name](*args)
         numbers = [a for a in args if isinstance(a, Value)]
         width = max(a.type.width for a in numbers)
         scalar = next((a.type.scalar for a in numbers if a.type.scalar != "i1"), None)
@@ -431,6 +434,27 @@ class Code:
         name = f"%m{self._count}"
         self._entry.append(f"  {name} = alloca [{count} x {type}], align 64")
         return Value(self, POINTER, name)
+
+    def gathered(self, pointer: Value, index: Value) -> Value:
+        """The values at indices of an array of doubles, one in each lane."""
+        if index.type.width == 1:
+            return self.load(pointer, index)
+        type, n = index.type.of("double"), index.type.width
+        name, places = f"llvm.masked.gather.{type.suffix}.v{n}p0", Type("ptr", n)
+        self.module.declare(name, f"declare {type} @{name}({places}, i32, <{n} x i1>, {type})")
+        place = self._new(places, f"getelementptr inbounds double, ptr {pointer.name}, {index.type} {index.name}")
+        given = f"{places} {place.name}, i32 8, <{n} x i1> splat (i1 true), {type} poison"
+        return self._new(type, f"call {type} @{name}({given})")
+
+    def table(self, table: Table) -> Value:
+        """The address of the numbers of a table, which the linker is told by its symbol."""
+        symbol = table.symbol
+        TABLES[symbol] = table
+        self.module.declare(symbol, f"@{symbol} = external global double")
+        self.module.declare(
+            f"{symbol}.place", f"@{symbol}.place = internal externally_initialized global ptr @{symbol}"
+        )
+        return self.load(Value(self, POINTER, f"@{symbol}.place"), 0, POINTER)
 
     def array(self, name: str, values: Iterable[Any], type: Type = DOUBLE) -> Value:
         """The address of numbers that stand in the module, under a name of it."""

@@ -26,6 +26,7 @@ from numpy.polynomial import Polynomial
 
 from sympflow.compiler.control import DOUBLE, LOWERED, Type, Value
 from sympflow.compiler.functions import COMPOSED, MOST_DERIVATIVES, OF_SCIPY, SPECIAL, fma, where
+from sympflow.compiler.tables import Table
 
 __all__ = ["LOWERED"]
 
@@ -512,6 +513,34 @@ for _name in OF_SCIPY:
 
 for _name, _composed in COMPOSED.items():
     _lowered(_name)(_composed.value)
+
+# numbers of tables ----------------------------------------------------------------------------------------------------
+
+
+def _entry(table: Table, i: Value, offset: float) -> Value:
+    code = i.code
+    return code.gathered(code.table(table), code.convert("fptosi", i, "i64") + int(offset))
+
+
+def _interval(table: Table, x: Value) -> Value:
+    code, last = x.code, len(table) - 2
+    if width := table.spacing:
+        place = _floor((x - float(table.values[0])) * (1.0 / width))
+        place = where(place >= 0.0, place, 0.0)
+        return where(place <= float(last), place, float(last))
+    start, type = code.table(table), x.type.of("i64")
+
+    def halved(k: Value, values: Sequence[Value]) -> list[Value]:
+        """Go on by a step, where the number there is not above x; then half of it."""
+        at, step = values
+        further = code.apply("min", (at + step, code.constant(last, type)))
+        return [code.select(code.gathered(start, further) <= x, further, at), step >> 1]
+
+    begin = code.constant(0, type), code.constant(1 << (last.bit_length() - 1) if last else 0, type)
+    return code.convert("sitofp", code.loop(last.bit_length(), [*begin], halved)[0], "double")
+
+
+LOWERED |= {"entry": _entry, "interval": _interval}
 
 # the derivatives of ln Γ, which C has not: Abramowitz and Stegun (1964), 6.3.18 and 6.4.11 from 16 on, below by
 # recurrence, below 1/2 by reflection --------------------------------------------------------------------------------

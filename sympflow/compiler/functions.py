@@ -15,6 +15,7 @@ import numpy as np
 
 from sympflow.compiler import NotCompiled
 from sympflow.compiler.numbers import Number
+from sympflow.compiler.tables import Table, entry_of, interval_of
 
 __all__ = ["FUNCTIONS", "Function", "added", "apply", "dot", "fma", "is_zero", "summed", "times", "where"]
 
@@ -48,7 +49,7 @@ def _alike(args: tuple[Any, ...]) -> list[Any]:
 
     tensors = [x for x in args if isinstance(x, torch.Tensor)]
     dtype = next((x.dtype for x in tensors if x.dtype != torch.bool), torch.float64)
-    return [x if isinstance(x, torch.Tensor) else tensors[0].new_tensor(x, dtype=dtype) for x in args]
+    return [x if isinstance(x, torch.Tensor | Table) else tensors[0].new_tensor(x, dtype=dtype) for x in args]
 
 
 def _special(name: str) -> Callable[..., Any]:
@@ -168,6 +169,8 @@ FUNCTIONS: dict[str, Function] = {
     "or": Function(np.logical_or, "logical_or", None, 1, "|"),
     "not": Function(np.logical_not, "logical_not", None, 1),
     "where": Function(np.where, "where", _choice, 2),
+    "entry": Function(entry_of, entry_of, lambda y, table, i, offset: (0.0, 0.0, 0.0), 8),
+    "interval": Function(interval_of, interval_of, lambda y, table, x: (0.0, 0.0), 20),
     "exp": Function(np.exp, "exp", lambda y, x: (y,), 45),
     "expm1": Function(np.expm1, "expm1", lambda y, x: (y + 1.0,), 48),
     "log": Function(np.log, "log", lambda y, x: (1.0 / x,), 55),
@@ -252,7 +255,7 @@ def apply(name: str, *args: Any) -> Any:
         if isinstance(x, Number):
             return x.apply(name, args)
     function = FUNCTIONS[name]
-    if all(isinstance(x, float | int | np.ndarray | np.generic) for x in args):
+    if all(isinstance(x, float | int | np.ndarray | np.generic | Table) for x in args):
         return function.numpy(*args)
     return function.torch(*args)
 

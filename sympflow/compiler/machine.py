@@ -7,14 +7,17 @@ import hashlib
 import os
 import re
 import threading
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import llvmlite.binding as llvm
+import numpy as np
 
 from sympflow.compiler import elementary  # noqa: F401  (code of functions, which texts are made of)
 from sympflow.compiler.functions import SPECIAL
+from sympflow.compiler.tables import SYMBOL, TABLES
 
 __all__ = ["Host", "address", "compiled", "host"]
 
@@ -63,6 +66,8 @@ def compiled(text: str, name: str, signature: Any) -> Any:
     with _LOCK:
         if SPECIAL in text:
             _resolve(set(re.findall(rf"@({SPECIAL}\w+)\(", text)))
+        for symbol in re.findall(rf"@({SYMBOL}\w+) = external", text) if SYMBOL in text else ():
+            llvm.add_symbol(symbol, TABLES[symbol].values.ctypes.data)
         engine = _LOADED.get(key)
         if engine is None:
             code = _stored(key)
@@ -94,12 +99,21 @@ def _resolve(names: set[str]) -> None:
 def address(array: Any) -> int:
     """Return where the numbers of a NumPy array lie in memory, of an empty one too, where code may look."""
     try:
-        return ctypes.addressof(_BYTE(array))  # a third of the time of what follows
+        return _PLACE(_BYTE(array))  # a third of the time of what follows
     except (TypeError, ValueError, BufferError):  # not to be written, or empty
         return int(array.ctypes.data)
 
 
-_BYTE = ctypes.c_char.from_buffer
+def given(arguments: Sequence[Any]) -> list[Any]:
+    """Return arguments as compiled code takes them: the places of arrays, and numbers."""
+    try:
+        return [_PLACE(_BYTE(x)) if type(x) is np.ndarray else x for x in arguments]
+    except (TypeError, ValueError, BufferError):
+        return [address(x) if isinstance(x, np.ndarray) else x for x in arguments]
+
+
+_BYTE: Any = ctypes.c_char.from_buffer
+_PLACE = ctypes.addressof
 
 
 def _object_code(text: str) -> bytes:

@@ -11,6 +11,7 @@ import numpy as np
 
 from sympflow.compiler.functions import FUNCTIONS, apply
 from sympflow.compiler.numbers import Number
+from sympflow.compiler.tables import Table
 
 __all__ = ["Program", "Traced", "adjoint", "derivatives", "fused", "gradient", "tangent", "traced"]
 
@@ -57,7 +58,7 @@ class Recording:
 
     def record(self, name: str, args: Sequence[Any]) -> Any:
         """Return the number of an operation, simplified where that is exact."""
-        args = tuple(x if isinstance(x, Traced) else _constant(x) for x in args)
+        args = tuple(x if isinstance(x, Traced | Table) else _constant(x) for x in args)
         for x in args:
             if isinstance(x, Traced) and x.recording is not self:
                 raise ValueError("numbers of two recordings cannot be combined: trace the functions together.")

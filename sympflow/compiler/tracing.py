@@ -20,6 +20,7 @@ import numpy as np
 from sympflow.arrays import is_tensor
 from sympflow.compiler.functions import COMPOSED, OF_SCIPY, apply
 from sympflow.compiler.program import Program, Recording, Traced, reached, traced
+from sympflow.compiler.splines import NotRecorded, recorded_splines
 
 __all__ = ["WEIGHTS", "Chain", "TracedArray", "Untraceable", "trace", "trace_chain"]
 
@@ -220,6 +221,14 @@ def _plain(x: Any) -> Any:
 
 def _holds_traced(index: Any) -> bool:
     return isinstance(index, TracedArray) or (type(index) is tuple and builtins.any(map(_holds_traced, index)))
+
+
+def _is_traced(x: Any) -> bool:
+    return isinstance(x, TracedArray)
+
+
+def _like_this(x: Any, like: Any) -> Any:
+    return _array(x, type(like))
 
 
 def _module(function: Any) -> str:
@@ -785,11 +794,13 @@ def _recorded(
         inputs += numbers
         args.append(np.ndarray.view(array, kind))
     try:
-        with warnings.catch_warnings(), np.errstate(all="ignore"):
+        with warnings.catch_warnings(), np.errstate(all="ignore"), recorded_splines(_is_traced, _like_this):
             warnings.simplefilter("ignore")
             value = _objects(_plain(function(*args)))
     except Untraceable:
         raise
+    except NotRecorded as error:
+        raise Untraceable(str(error)) from error
     except RecursionError as error:
         raise Untraceable("it is too deep to be traced") from error
     except Exception as error:  # whatever a user's function raises

@@ -30,9 +30,9 @@ LONGEST_MESSAGE = 400
 class Chunk:
     """Some orbits of an ensemble, one after another in its order; a reduction makes its fields of them.
 
-    `t_eval` (m,) are the times of the states that a reduction sees, None for every step; `y0` is (n, 2d); `params` are
-    values (n,) of the parameters of each orbit, where they are others than the system's; `first` is the number of the
-    first orbit within the ensemble. `status` (n,) is 0, or −1 for an orbit that failed, `messages` say why.
+    `t_eval` (m,) are the times of the states that a reduction is given, None for every step; `y0` is (n, 2d);
+    `params` are values (n,) of the parameters of each orbit, where they are others than the system's; `first` is the
+    number of the first orbit within the ensemble. `status` (n,) is 0, or −1 for a failed orbit, `messages` say why.
     """
 
     system: HamiltonianSystem
@@ -85,7 +85,7 @@ class Chunk:
 
     @cached_property
     def times(self) -> np.ndarray:
-        """The times (m,) of the states that a reduction sees."""
+        """The times (m,) of the states that a reduction is given."""
         if self.t_eval is not None:
             return self.t_eval
         length = self.integrator.step_length(self.system) if self.integrator.on_grid else None

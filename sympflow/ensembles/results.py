@@ -14,7 +14,7 @@ import numpy as np
 from sympflow.ensembles.orbits import Drawn, Given
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.contract import Integrator, method_text
-from sympflow.show.cards import Card, Shown, numbers
+from sympflow.show.cards import Answering, Card, numbers
 from sympflow.show.pictures import histogram_figure, points_figure
 from sympflow.show.style import saved
 from sympflow.storage import layout as names
@@ -219,7 +219,7 @@ class Memory:
 
 
 @dataclass(repr=False)
-class Ensemble(Shown):
+class Ensemble(Answering):
     """The result of `ensemble`.
 
     Every field that was kept of the orbits is an attribute: `y` where nothing was reduced, else what `reduce` says. An

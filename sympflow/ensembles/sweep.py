@@ -84,7 +84,7 @@ def ensemble(
         Values of parameters of the system. Arrays span a grid, with an axis for each in front of that of the orbits; a
         number replaces the system's value.
     t_eval : array_like of shape (m,), optional
-        Times to report, or that `reduce` sees. The default is every step.
+        Times to report, or at which `reduce` is given states. The default is every step.
     reduce : str, Reduction, or callable, optional
         What is kept of each orbit instead of its states: a name of `sympflow.ensembles.reductions.REDUCTIONS`, such as
         "final"; or a function of (t, y), the times (m,) and states (2d, m) of one orbit, that returns a number, an

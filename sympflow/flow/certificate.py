@@ -2,7 +2,7 @@
 
     |H(ψ_kΔt(x)) − H(x)| ≤ k δ,    δ = ∫₀^Δt sup_x |∇Hᵀ J ∇(𝓗 − H)|(ψ̄_t(x)) dt,
 
-as long as the orbit is in Ω at every step: d/dt H(ψ̄_t(x)) = ∇Hᵀ J ∇𝓗, of which ∇Hᵀ J ∇H = 0 is no part. The suprema
+as long as the orbit is in Ω at every step: d/dt H(ψ̄_t(x)) = ∇Hᵀ J ∇𝓗, where ∇Hᵀ J ∇H = 0 drops out. The suprema
 are estimates over seeded samples of Ω × [0, Δt]; beside them stand measured errors of held-out orbits.
 """
 

@@ -33,11 +33,11 @@ def certify(
 
     states, times, held_out, seed = (size[name] for name in ("states", "times", "held_out", "seed"))
     system.check_conservative(
-        "which takes energy away, and a certificate bounds the error of an energy that is kept",
+        "which takes energy away, and a certificate bounds the error of a conserved energy",
         "see flow.figures, or sympflow.reference_error of a run",
     )
     system.check_autonomous(
-        "so that its energy changes, and a certificate bounds the error of an energy that is kept",
+        "so that its energy changes, and a certificate bounds the error of a conserved energy",
         "see flow.figures, or sympflow.energy_balance_error of a run",
     )
     x, unseen = (domain.sample(n, _seed(seed, i)) for i, n in enumerate((states, held_out)))

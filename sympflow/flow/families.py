@@ -12,20 +12,18 @@ from typing import Any
 from sympflow.lazy import whole_import
 
 FAMILIES = {
-    "sympflow": "sympflow.flow.sympflow:SympFlow",
-    "primed": "sympflow.flow.primed:PrimedFlow",
     "split": "sympflow.flow.split:SplitFlow",
     "clocked": "sympflow.flow.clocked:ClockedFlow",
     "kepler": "sympflow.flow.planetary:KeplerFlow",
     "collocated": "sympflow.flow.collocated:CollocatedFlow",
+    "primed": "sympflow.flow.primed:PrimedFlow",
+    "sympflow": "sympflow.flow.sympflow:SympFlow",
     "mlp": "sympflow.flow.mlp:MLPFlow",
 }
-"""The module and the class of each."""
+"""The module and the class of each. A file is of the first family that its plan names, and else of its kind."""
 
 KINDS = ("sympflow", "mlp")
 """The kinds that files name, which are the methods that run the flows: SympFlows, and their baseline."""
-
-_OF_SYMPFLOW = ("split", "clocked", "kepler", "collocated", "primed")
 
 
 def family(name: str) -> Any:
@@ -35,5 +33,5 @@ def family(name: str) -> Any:
 
 
 def family_of(kind: str, plan: Mapping[str, Any]) -> Any:
-    """Return the class that a flow of this kind and architecture is of: a SympFlow's plan names a special family."""
-    return family(kind if kind == "mlp" else next((name for name in _OF_SYMPFLOW if name in plan), "sympflow"))
+    """Return the class of a flow of this kind and architecture."""
+    return family(kind if kind == "mlp" else next((name for name in FAMILIES if name in plan), "sympflow"))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from itertools import chain
@@ -16,6 +17,7 @@ from torch import Tensor, nn
 
 from sympflow.arguments import plain
 from sympflow.arrays import differentiable, finite_states, has_values, readable, to_numpy, values, values_of_times
+from sympflow.compiler import NotCompiled
 from sympflow.flow.certificate import Certificate
 from sympflow.flow.certification import certify
 from sympflow.flow.files import write
@@ -25,7 +27,7 @@ from sympflow.flow.weights import checksum
 from sympflow.hamiltonian.domain import EnergySublevel
 from sympflow.hamiltonian.doubling import doubled
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.show.cards import Card, Shown
+from sympflow.show.cards import Card, Shown, brief
 from sympflow.show.pictures import trajectory_figure
 from sympflow.show.style import saved
 
@@ -34,7 +36,7 @@ if TYPE_CHECKING:  # a flow needs it only to be compiled
 
     from sympflow.kernels.network_tangents import NetworkTangents
 
-DRAWN, DRAWN_STEPS = 4, 400  # orbits of a figure, and their steps
+DRAWN, DRAWN_STEPS, SHOWN_STEPS = 4, 400, 100  # orbits of a figure, their steps, and those that a notebook shows
 MAX_STEPS = 10_000_000  # of one call
 NO_NUMBER = torch.empty(0, dtype=torch.float64)
 MEAN_TIMES = (0.5 - 0.75**0.5 / 3, 0.5 + 0.75**0.5 / 3)  # in Δt, at which 𝓗 is averaged: Gauss's
@@ -188,7 +190,7 @@ class FlowMap(KnownFlow, Shown, nn.Module):
         x : tensor, shape (..., 2d)
             In the dtype and on the device of the flow.
         t0 : float or tensor
-            The time of x, of a driven system, for which alone it counts: one, or one for each state.
+            The time of x, for a driven system only: one number, or one for each state.
 
         Raises
         ------
@@ -239,7 +241,7 @@ class FlowMap(KnownFlow, Shown, nn.Module):
         return torch.cat([z[..., : self.ndof], z[..., self.ndof + 1 :]], dim=-1) if self.driven else z
 
     def on_extended(self, extended: HamiltonianSystem) -> Self | None:
-        """Return the same maps of a driven system with a coordinate more, of which the momentum is −∫ ∂H/∂t dt.
+        """Return the same maps of a driven system with one more coordinate, whose momentum is −∫ ∂H/∂t dt.
 
         None where the maps do not use the functions of a system.
         """
@@ -529,14 +531,14 @@ class FlowMap(KnownFlow, Shown, nn.Module):
             "Δt": f"{self.dt:g}",
             "degrees of freedom": f"{self.ndof:,}",
             "parameters": f"{self.n_parameters:,}",
-            "domain": "" if self.domain is None else repr(self.domain),
+            "domain": "" if self.domain is None else brief(repr(self.domain)),
             **{name: f"{value:.3g}" for name, value in told.items()},
         }
         certificate = "" if self.certified is None else str(self.certified)
         return Card(repr(self).split(":")[0].strip("<>"), facts, certificate)
 
     def preview(self) -> Figure | None:
-        return self.plot() if self.domain is not None or self.system is not None else None
+        return self._drawn(self.system, SHOWN_STEPS) if self.domain is not None or self.system is not None else None
 
     def plot(self, system: HamiltonianSystem | None = None, path: str | os.PathLike[str] | None = None) -> Figure:
         """Draw orbits of the flow from four states of its domain, and their energy error.
@@ -553,7 +555,10 @@ class FlowMap(KnownFlow, Shown, nn.Module):
         ValueError
             If it has neither a domain nor a system with a `y0`.
         """
-        system = self.system if system is None else system
+        return saved(self._drawn(self.system if system is None else system, DRAWN_STEPS), path)
+
+    def _drawn(self, system: HamiltonianSystem | None, steps: int) -> Figure:
+        """The figure of so many steps."""
         domain = self.domain if system is None else self.domain_for(system) or system.domain
         if domain is None and (system is None or system.y0 is None):
             raise ValueError("`system` is needed, for the flow has no domain to start in: pass one with a `y0`.")
@@ -561,18 +566,26 @@ class FlowMap(KnownFlow, Shown, nn.Module):
             raise ValueError(
                 "`system` is needed, whose H bounds the domain of the flow: pass it, or load the flow with it."
             )
-        y0 = np.atleast_2d(system.y0) if domain is None else domain.sample(DRAWN, 0)  # type: ignore[union-attr, arg-type]
-        states = [torch.as_tensor(y0, dtype=self.dtype, device=self.device)]
-        with torch.no_grad():
-            for k in range(DRAWN_STEPS):
-                states.append(self(self.dt, states[-1], **({"t0": k * self.dt} if self.driven else {})))
-        y = to_numpy(torch.stack(states, dim=-1)).astype(float)
+        y0 = np.atleast_2d(system.y0) if domain is None else domain.sample(DRAWN, 0)  # type: ignore[union-attr]
+        y = np.moveaxis(self._orbits(system, y0, steps), -2, -1)
         error = None
         if system is not None and system.keeps_energy:
             H = np.asarray(system.hamiltonian(np.moveaxis(y, -1, 0))).T
             error = (H - H[:, :1]) / (system.energy_scale or np.abs(H[:, :1]))
         heading = f"{repr(self).split(':')[0].strip('<>')}, Δt = {self.dt:g}"
-        return saved(trajectory_figure(self.dt * np.arange(len(states)), y, error, heading, marker="."), path)
+        return trajectory_figure(self.dt * np.arange(y.shape[-1]), y, error, heading, marker=".")
+
+    def _orbits(self, system: HamiltonianSystem | None, y0: np.ndarray, steps: int) -> np.ndarray:
+        """The states (N, n, 2d) after steps from the states y0 (N, 2d), compiled where that is possible."""
+        if system is not None:
+            with suppress(NotCompiled):
+                kernel = self.kernel_for(system)
+                return kernel.run(self.dt, y0, steps, np.arange(steps + 1)).states
+        states = [torch.as_tensor(y0, dtype=self.dtype, device=self.device)]
+        with torch.no_grad():
+            for k in range(steps):
+                states.append(self(self.dt, states[-1], **({"t0": k * self.dt} if self.driven else {})))
+        return to_numpy(torch.stack(states, dim=-2)).astype(float)
 
     def __repr__(self) -> str:
         system = f" of {self.system_name}" if self.system_name else ""
@@ -598,9 +611,7 @@ def start_time(t0: Any, x: Tensor, period: float | None) -> Tensor:
     if x.dtype == torch.float64:
         return time
     if period is None:
-        raise TypeError(
-            f"`x` is {x.dtype}, in which times are rounded too much: use float64, or give the system its `period`."
-        )
+        raise TypeError(f"`x` is {x.dtype}, which rounds times too much: use float64, or give the system its `period`.")
     return time % period
 
 

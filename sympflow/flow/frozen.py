@@ -19,6 +19,7 @@ from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.system import HamiltonianSystem
 
 if TYPE_CHECKING:
+    from sympflow.flow.loops import PrimedFlowKernel
     from sympflow.hamiltonian.local import LocalHamiltonian
     from sympflow.kernels.networks import NetworkLayer
     from sympflow.kernels.protocol import Kernel
@@ -49,13 +50,16 @@ class PrimedKnown(KnownFlow):
         tables = self.tables
         if tables.kernel is not None and tables.kernel.system is system and not compensated:
             return tables.kernel
+        self.check_compilable()
+        made = self._compiled_for(system, compensated)
+        if not compensated:
+            tables.kernel = made
+        return made
+
+    def _compiled_for(self, system: HamiltonianSystem, compensated: bool) -> PrimedFlowKernel:
         from sympflow.flow.loops import PrimedFlowKernel
 
-        self.check_compilable()
-        if compensated:
-            return PrimedFlowKernel(tables, system, compensated=True)
-        tables.kernel = PrimedFlowKernel(tables, system)
-        return tables.kernel
+        return PrimedFlowKernel(self.tables, system, compensated)
 
     def check_compilable(self) -> None:
         """Raise a ValueError unless the numbers of the flow are float64 on the CPU, which compiled loops need."""
@@ -182,7 +186,7 @@ class FrozenNetwork(KnownFlow):
 
     @classmethod
     def of_file(cls, path: Path, system: HamiltonianSystem) -> Self | None:
-        """Read a flow that ships, of that system; None if it is none of networks."""
+        """Read a flow that ships, of that system; None unless it is a flow of networks."""
         from sympflow.kernels.networks import NetworkLayer
 
         record, arrays = _read(path)

@@ -101,7 +101,7 @@ class KnownFlow:
 
     @property
     def kept_ndof(self) -> int:
-        """The degrees of freedom of the system that the flow is known by, and that its file tells of."""
+        """The degrees of freedom of the system by which the flow is recognised, as its file keeps it."""
         return self.ndof
 
     def matches(self, system: HamiltonianSystem) -> bool:
@@ -145,7 +145,7 @@ class KnownFlow:
             reason = reason or " (its friction is another)" * damped
             raise ValueError(
                 f"`system` {system.name!r} is another {system.local.noun} than that of this flow{reason}: its numbers "
-                f"cancel the errors of its own terms alone. {remedy[0].upper()}{remedy[1:]}"
+                f"cancel the errors of its own terms only. {remedy[0].upper()}{remedy[1:]}"
             )
         if system.local is not None and self.lattice_terms:
             raise ValueError(
@@ -212,8 +212,8 @@ class KnownFlow:
             inside = (r > low + slack) & (r < high - slack) & (r > slack) & (r < self.dt - slack)
             if inside.any():
                 warn(
-                    f"The flow was fitted to labels, of which none is at a time between {low:g} and {high:g}: what it "
-                    "gives there was compared with nothing. Ask for results at multiples of its "  # one text for all t
+                    f"The flow was fitted to labels, none of them at a time between {low:g} and {high:g}: its "
+                    "values there were not compared. Ask for results at multiples of its "  # one text for all t
                     f"Δt = {self.dt:g}, or train it with labels at more times, or by loss='labels+residual'."
                 )
                 return

@@ -37,7 +37,7 @@ class PrimedFlowKernel(Kernel):
         known = system.form is not None or (tables.level == CURVATURE and system.local is not None)
         if tables.level >= CURVATURE and not known:
             raise arrays_only(
-                f"`system` {system.name!r} has no symbols, from which curvature terms and polynomials are compiled"
+                f"`system` {system.name!r} has no symbols, and curvature terms and polynomials are compiled from these"
             )
         self.system = system
         self._tables, self._splitting, self._compensated = tables, splitting_loops(system), compensated

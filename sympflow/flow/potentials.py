@@ -171,7 +171,7 @@ class Register(Generic[T]):
             self.added[name] = self.checked(name, load_announced(point, self.kind))
         except (TypeError, ValueError) as error:
             raise ImportError(
-                f"`{self.kind}` {name!r} of the plug-in {distribution(point)} is none ({error}): report it there."
+                f"`{self.kind}` {name!r} of the plug-in {distribution(point)} is not valid ({error}): report it there."
             ) from error
         return self.added[name]
 
@@ -271,7 +271,7 @@ def by_time(f: Callable[[Tensor], Tensor], like: Tensor) -> tuple[Tensor, Tensor
 
 
 class Potential(nn.Module):
-    """V(t, x), of which layers need three combinations; a new kind of potential provides these.
+    """V(t, x). Layers need three combinations of it; a new kind of potential provides these.
 
     Duties
     ------
@@ -308,7 +308,7 @@ class Potential(nn.Module):
     @classmethod
     def from_dict(cls, ndof: int, plan: Mapping[str, Any], dtype: torch.dtype) -> Self:
         """Return the untrained potential of an architecture that a file describes."""
-        raise NotImplementedError(f"{cls.__name__} must define from_dict(), by which files are read.")
+        raise NotImplementedError(f"{cls.__name__} must define from_dict(), which reads files.")
 
 
 class MLPPotential(Potential):
@@ -683,7 +683,7 @@ def _checked_potential(name: str, potential: Any) -> type[Potential]:
     if not (isinstance(potential, type) and issubclass(potential, Potential)):
         raise TypeError(f"`potential` must be a subclass of Potential; got {potential!r}.")
     if potential.from_dict.__func__ is Potential.from_dict.__func__:  # type: ignore[attr-defined]
-        raise TypeError(f"`potential` {potential.__name__} has no from_dict(), by which files are read: define it.")
+        raise TypeError(f"`potential` {potential.__name__} has no from_dict(), which reads files: define it.")
     return potential
 
 

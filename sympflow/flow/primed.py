@@ -101,11 +101,7 @@ class PrimedFlow(PrimedKnown, SystemFlow):
                 f"`system` {system.name!r} has a kinetic energy that depends on t, and flows are primed with V(q, t) "
                 "alone: use a splitting method such as 'kahan_li8'."
             )
-        if system.friction and not system.quadratic_kinetic:
-            raise ValueError(
-                f"`system` {system.name!r} has friction, which drifts hold where the kinetic energy is ½ pᵀM⁻¹p: use a "
-                "Runge–Kutta method such as 'dop853'."
-            )
+        system.check_damped_drifts()
         exponents = _monomials_of(system, polynomial, force_gradient, curvature)
         force_gradient = _force_gradient_of(system, False if exponents else force_gradient, curvature)
         for name, value in (("stages", stages), ("processor", processor)):
@@ -305,7 +301,7 @@ class PrimedFlow(PrimedKnown, SystemFlow):
         return other
 
     def force_gradient_coefficients(self) -> np.ndarray:
-        """−½|∇V|²_{M⁻¹} by the monomials of the kicks (M,); 0 where it is no such polynomial."""
+        """−½|∇V|²_{M⁻¹} by the monomials of the kicks (M,); 0 where it is not such a polynomial."""
         system = self.system
         assert system is not None
         assert system.symbols is not None

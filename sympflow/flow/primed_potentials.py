@@ -39,8 +39,8 @@ def _called(f: Callable[..., Array], system: HamiltonianSystem, q: Tensor, t: Te
         return f(q, t)
     if q.requires_grad:
         raise TypeError(
-            f"`system` {system.name!r} has functions of NumPy arrays, through which no gradient flows: write them for "
-            "tensors too, or use HamiltonianSystem.from_sympy."
+            f"`system` {system.name!r} has functions of NumPy arrays, and gradients do not flow through these: write "
+            "them for tensors too, or use HamiltonianSystem.from_sympy."
         )
     times = None if t is None else t.cpu().numpy()
     return torch.as_tensor(f(q.cpu().numpy(), times), dtype=q.dtype, device=q.device)
@@ -126,14 +126,9 @@ class PrimedDrift(Drift):
 
     def _drifted(self, s: Time, q: Tensor, p: Tensor, passed: Time = 0.0) -> tuple[Tensor, Tensor]:
         """The linear map of a drift over s, and by how much the time moves with it."""
-        system = self._binding.system
-        if not system.friction:
-            mean, end = _each(s) * p.T, p
-        else:
-            mean, end = system.friction.drift(p.T, _each(s))
-            end = end.T
-        d = system.ndof
-        return torch.cat([q[:d] + system.velocity(mean).T, q[d:] + passed]), end
+        d = self._binding.system.ndof
+        moved, end = self._binding.system.drifted(q[:d].T, p.T, 0.0, _each(s))
+        return torch.cat([moved.T, q[d:] + passed]), end.T
 
     def forward(self, t: Time, q: Tensor, p: Tensor, back: bool = False) -> tuple[Tensor, Tensor]:
         if self._plain:
@@ -149,8 +144,7 @@ class PrimedDrift(Drift):
         q, p = self._drifted(s, q, p, s)
         dq, dp = self._drifted(s, dq, dp, rate)
         d = system.ndof
-        if system.friction:
-            dp = dp + rate * system.friction.force(p.T).T
+        dp = dp + rate * system.friction.force(p.T).T
         return q, p, torch.cat([dq[:d] + rate * system.velocity(p.T).T, dq[d:]]), dp
 
     def pull_back(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -84,7 +84,7 @@ class Provenance:
 
     @classmethod
     def of_record(cls, record: dict[str, Any], ndof: int) -> Self:
-        """Return what the record tells, all of it checked."""
+        """Return the provenance of a record, all of it checked."""
         missing = [name for name in FIELDS if name not in record]
         if missing:
             raise Refused(f"its record has no {', '.join(missing)}")
@@ -181,7 +181,7 @@ def read(path: Path) -> tuple[bytes, dict[str, Any], dict[str, Any], bool]:
     if isinstance(format_, bool) or not isinstance(format_, int):
         raise Refused("its record has no format number")
     if format_ < 1:
-        raise Refused(f"its format {format_} is not one there has been")
+        raise Refused(f"its format {format_} is unknown")
     if format_ > FORMAT:
         raise Refused(f"its format {format_} is later than {FORMAT}, which this version of sympflow reads: update it")
     if record.get("kind") not in KINDS:
@@ -226,10 +226,10 @@ def checked_integer(value: Any, what: str, largest: int) -> int:
 def checked_widths(hidden: Any, inputs: int) -> tuple[int, ...]:
     """Return the widths of hidden layers that a record gives; else they are refused."""
     if not isinstance(hidden, list) or not 1 <= len(hidden) <= MAX_LAYERS:
-        raise Refused("its hidden layers are missing or absurdly many")
+        raise Refused("its hidden layers are missing or too many")
     widths = tuple(checked_integer(h, "hidden width", MAX_WIDTH) for h in hidden)
     if count_parameters(widths, inputs) > MAX_PARAMETERS:
-        raise Refused("its architecture is absurdly large")
+        raise Refused("its architecture is too large")
     return widths
 
 

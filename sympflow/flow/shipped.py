@@ -46,6 +46,8 @@ class ShippedFlow:
         Number of pairs of its processor.
     polynomial : int
         Degree of the polynomials of its kicks, 0 for none.
+    reach : int
+        Steps to either side over which the processor of a flow of planets goes; 0 for other flows.
     cost : float or None
         Of a unit of time, in force evaluations, see `cost_of` in `sympflow.training.shipped.judges`. Outputs are
         not counted.
@@ -69,6 +71,7 @@ class ShippedFlow:
     stages: int | None
     processor: int
     polynomial: int
+    reach: int
     cost: float | None
     energy_error: float | None
     t_end: float | None
@@ -97,6 +100,7 @@ class ShippedFlow:
             stages=None if primed is None else primed["maps"] // 2,
             processor=0 if primed is None else primed.get("processor", 0),
             polynomial=0 if primed is None else max(map(sum, primed.get("monomials", ())), default=0),
+            reach=plan.get("kepler", {}).get("reach", 0),
             energy_error=figures.get("energy_error_95"),
             cost=figures.get("cost"),
             t_end=figures.get("t_end"),
@@ -161,6 +165,7 @@ class ShippedFlows(Sequence[ShippedFlow]):
             architecture = architecture if f.shift is None else "logarithmic, with a clock"
             architecture += f" of degree {f.polynomial}" if f.polynomial else ""
             architecture += f", processor {f.processor}" if f.processor else ""
+            architecture = f"planets, reach {f.reach}" if f.reach else architecture
             until = "" if f.t_end is None else f" (T = {f.t_end:g})"
             yield (
                 f.name,
@@ -270,8 +275,9 @@ def choose(
             "float64 and without `compensated`: pass these, or "
         )
         raise ValueError(
-            f"`tol` {tol:g} is met by no flow that ships for {system.name!r}{' and can run here' if others else ''} "
-            f"(relative energy errors: {there}): {clock if others else ''}raise it, or train a flow and pass flow=flow."
+            f"`tol` {tol:g} is not met by any flow that ships for "
+            f"{system.name!r}{' and can run here' if others else ''} (relative energy errors: {there}): "
+            f"{clock if others else ''}raise it, or train a flow and pass flow=flow."
         )
     return able[0]
 
@@ -288,7 +294,7 @@ def named(name: str) -> ShippedFlow:
         close = difflib.get_close_matches(name, [f.name for f in _catalogue()], n=3)
         hint = f"Is it {' or '.join(map(repr, close))}? " if close else ""
         raise ValueError(
-            f"`flow` {name!r} is the name of no flow that ships. {hint}`sympflow flows` lists them; flows from other "
+            f"`flow` {name!r} does not name a flow that ships. {hint}`sympflow flows` lists them; flows from other "
             "files are read by sympflow.load."
         )
     return found[0]

@@ -311,14 +311,14 @@ class SplitFlow(SystemFlow):
                 raise Refused(f"its {name} are not a list of {', '.join(admissible)}")
         sequence, expressions, n = plan.get("sequence"), plan.get("expressions"), len(plan["kinds"])
         if not isinstance(sequence, list) or not 1 <= len(sequence) <= MAX_LAYERS:
-            raise Refused("its sequence of maps is missing or absurdly long")
+            raise Refused("its sequence of maps is missing or too long")
         if not all(isinstance(k, int) and not isinstance(k, bool) and 0 <= k <= n for k in sequence):
             raise Refused("its sequence of maps does not consist of numbers of parts")
         if expressions is not None:
             _check_expressions(expressions, n)
         terms = checked_integer(plan.get("terms"), "number of terms", MAX_DEGREE)
         if len(sequence) * terms * (len(plan["classes"]) + 2) > MAX_PARAMETERS // 100:
-            raise Refused("its architecture is absurdly large")
+            raise Refused("its architecture is too large")
         names = ("sequence", "kinds", "classes", "terms", "filters", "gradients", "expressions")
         return {name: plan.get(name) for name in names}
 

@@ -520,7 +520,7 @@ class SympFlow(FlowMap):
     def from_architecture(cls, ndof: int, plan: dict[str, Any], dt: float, dtype: torch.dtype) -> Self:
         layers = plan.get("layers")
         if not isinstance(layers, list) or not 1 <= len(layers) <= MAX_LAYERS:
-            raise Refused("its list of layers is missing or absurdly long")
+            raise Refused("its list of layers is missing or too long")
         # All sizes first: nothing is allocated for a file that asks for too much.
         drive = _drive_of(plan.get("drive"))
         potentials = [_potential_of(layer) for layer in layers]
@@ -529,7 +529,7 @@ class SympFlow(FlowMap):
         if any(p.get("features", 0) != inputs - ndof for p in potentials if p["type"] == "mlp"):
             raise Refused("its potentials do not take the time of its drive")
         if sum(count_parameters(w, inputs) for w in widths) > MAX_PARAMETERS:
-            raise Refused("its architecture is absurdly large")
+            raise Refused("its architecture is too large")
         built = [_built(potential, ndof, dtype) for potential in potentials]
         made = (LAYERS[layer["kind"]](potential) for layer, potential in zip(layers, built, strict=True))
         return cls.from_layers(made, dt, drive)
@@ -702,9 +702,9 @@ class SystemFlow(SympFlow, ABC):
             kernels[compensated] = system, flow._compiled_for(system, compensated)
         return kernels[compensated][1]
 
+    @abstractmethod
     def _compiled_for(self, system: HamiltonianSystem, compensated: bool) -> Kernel:
         """The compiled loops of the flow on a system."""
-        raise NotImplementedError
 
 
 def _drive_of(told: Any) -> Drive | None:

@@ -43,7 +43,7 @@ def checked_device(device: Any) -> torch.device | None:
         torch.empty(0, device=there)
     except (RuntimeError, AssertionError, NotImplementedError, ImportError) as error:
         reason = str(error).splitlines()[0].rstrip(". ") if str(error) else type(error).__name__
-        raise ValueError(f"`device` {str(device)!r} is not to be had here ({reason}): use device='cpu'.") from None
+        raise ValueError(f"`device` {str(device)!r} is not available here ({reason}): use device='cpu'.") from None
     return there
 
 

@@ -94,7 +94,7 @@ class CallableHamiltonian(Definition):
 
     @np.errstate(all="ignore")
     def as_sum(self) -> tuple[CallableHamiltonian, np.ndarray | None, bool] | None:
-        """The definition of H = T(p) + V(q) by V, M⁻¹, and whether T = ½ pᵀM⁻¹p; None of an H that is no such sum."""
+        """The definition of H = T(p) + V(q) by V, M⁻¹, and whether T = ½ pᵀM⁻¹p; None for any other H."""
         form, d = self.form, self.ndof
         if form is None or self.separable:
             return None
@@ -123,6 +123,11 @@ class CallableHamiltonian(Definition):
 
     def identity_parts(self) -> Any:
         return [self.ndof, self._functions] if self.timed else [self.ndof, *self._functions]
+
+    @property
+    def name(self) -> str:
+        letter, name = "V" if self._name == "potential" else "H", getattr(self._given_function, "__name__", "")
+        return f"{letter} = {name}" if name.isidentifier() else f"{letter} of a function"
 
     def place(self, y0: Any, domain: Any, inverse_mass: np.ndarray | None, t_span: tuple[float, float]) -> None:
         self._scene = y0, domain, inverse_mass, t_span
@@ -211,7 +216,7 @@ class CallableHamiltonian(Definition):
         if not np.isfinite(values).any():
             raise Untraceable("it is not finite at the states at which it was tried: give `y0`")
         if not _alike(form.value(x, *at), values):
-            raise Untraceable("the values of what was traced are others: it depends on more than its arguments")
+            raise Untraceable("what was traced has other values: the function depends on more than its arguments")
         self._compare_given(form, x, times)
         i = int(np.nanargmax(np.where(np.isfinite(values), np.abs(values), np.nan)))
         self._known = states[i], times[i], float(values[i])
@@ -290,16 +295,15 @@ class CallableHamiltonian(Definition):
                 f"the state {state[:8]}: it reads something that has changed since. Make a new HamiltonianSystem."
             )
 
-    def _exact(self, x: Array) -> TracedHamiltonian | None:
-        """The program, where it gives derivatives for x: torch differentiates functions of its own tensors itself."""
-        form = self.form
-        if form is None or (is_tensor(x) and self._follows_tensors):
+    def _exact(self, x: Array, function: Any = None) -> TracedHamiltonian | None:
+        """The program, where it is taken at x: in place of a user's function, if one is given, for tensors only.
+
+        Torch differentiates functions of its own tensors itself.
+        """
+        form, tensor = self.form, is_tensor(x)
+        if form is None or (tensor and self._follows_tensors) or not (tensor or function is None):
             return None
         return form if self.library == "numpy" or form.size <= MOST_BY_ARRAYS else None
-
-    def _in_place_of(self, function: Any, x: Array) -> TracedHamiltonian | None:
-        """The program in place of a user's function: where that was not given, or takes no tensors such as x."""
-        return self._exact(x) if function is None or is_tensor(x) else None
 
     @cached_property
     def _follows_tensors(self) -> bool:
@@ -398,7 +402,7 @@ class CallableHamiltonian(Definition):
 
     def hamiltonian(self, x: Array, *t: Any) -> Array:
         """V of q or H of y, by the function itself, but for tensors that it does not take."""
-        if (form := self._in_place_of(self._own, x)) is not None:
+        if (form := self._exact(x, self._own)) is not None:
             return form.value(x, *t)
         _ = self.form  # finds out for which library the function is written
         if self._gradient is not None or self.library == library_name(x) == "numpy":
@@ -406,7 +410,7 @@ class CallableHamiltonian(Definition):
         return _with_torch(partial(self._own, *t), x, self._name, (), self._reason)
 
     def gradient(self, x: Array, *t: Any) -> Array:
-        if self._gradient is None or self._in_place_of(self._gradient, x) is not None:
+        if self._gradient is None or self._exact(x, self._gradient) is not None:
             return self._derived("gradient", _gradient_of, x, x.shape[-1:], t)
         return _checked(self._protected(self._gradient, "gradient", t, x), x, "gradient", x.shape[-1:])
 
@@ -459,7 +463,7 @@ class CallableHamiltonian(Definition):
             raise ValueError(f"{refused}, q.copy() ({error}).") from error
 
     def hessian_vector(self, q: Array, v: Array, *t: Any) -> Array:
-        if (form := self._in_place_of(self._hessian_vector, q)) is not None:
+        if (form := self._exact(q, self._hessian_vector)) is not None:
             return form.hessian_vector(q, v, *t)
         if self._hessian_vector is None:
             return super().hessian_vector(q, v, *t)
@@ -542,13 +546,11 @@ def _hessian_of(f: Callable[[Array], Array], name: str) -> Callable[[Array], Arr
 def _with_torch(
     f: Callable[[Array], Array], x: Array, name: str, tail: tuple[int, ...], reason: tuple[str, bool]
 ) -> Array:
-    """f(x) for a function written with torch; NumPy arrays go through tensors that share their memory.
+    """f(x) for a function written with torch; NumPy arrays go through tensors.
 
     `reason` is why it was not traced, and whether it is written for NumPy's arrays.
     """
-    import torch
-
-    tensor = x if is_tensor(x) else torch.from_numpy(np.ascontiguousarray(x))
+    tensor = as_tensor(x)
     version, value, failure = _version(tensor), None, None
     untraced, of_numpy = reason
     with warnings.catch_warnings() if of_numpy else nullcontext():

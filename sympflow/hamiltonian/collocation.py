@@ -50,8 +50,6 @@ def stage_times(tableau: Tableau, t: Any, y: Array, h: Any) -> Any:
 def advanced(system: HamiltonianSystem, tableau: Tableau, y: Array, K: Array, h: Any) -> Array:
     """The state at the end of a step of length h (..., 1), or a number, with the increments K (..., s, 2d)."""
     end = y + sum(b * K[..., i, :] for i, b in enumerate(tableau[1]))
-    if not system.friction:
-        return end
     d = system.ndof
     return concatenate([end[..., :d], system.friction.drift(end[..., d:], h)[1]])
 

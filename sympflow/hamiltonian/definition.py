@@ -6,11 +6,17 @@ import copy
 from collections.abc import Sequence
 from functools import cached_property
 from math import inf
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sympflow.arrays import Array
+
+if TYPE_CHECKING:
+    from sympflow.hamiltonian.poles import Places
+
+ASIDE = 64 * float(np.finfo(float).eps)
+"""Share of the times between which a run goes on from a jump, or ends before it, so that H is that of one side."""
 
 
 def bare_copy(x: Any) -> Any:
@@ -46,13 +52,17 @@ class Definition:
     loops: str = ""  # the compiled loops of a definition by one piece: see `sympflow.hamiltonian.local`
     leaps: bool = False  # bodies may meet, over which a step may leap: then there is `leapt`
     impulses: tuple[Any, ...] = ()  # DiracDelta in t: then there are `between_impulses` and `kicks`
-    poles: Any = None  # `Poles`, `TracedPoles` or None: where H is infinite or no number, and steps may leap over
     form: Any = None  # the program of functions that could be traced: see `sympflow.hamiltonian.formulas`
     layered: Any = None  # V with layers whose weights torch follows: see `sympflow.hamiltonian.layered`
     untraced: str = ""  # the reason for which they could not, a clause, known after `form`
     given_functions: bool = False  # of Python, which are traced where that is possible
     instead: str = "an implicit method such as 'gauss_legendre6', or a Runge–Kutta method"
     _generated: tuple[str, ...] = ("_functions",)  # what cannot be pickled, and is made again
+
+    @property
+    def name(self) -> str:
+        """The name of a system to which none was given."""
+        return ""
 
     def __getstate__(self) -> dict[str, Any]:
         return {name: value for name, value in vars(self).items() if name not in self._generated}
@@ -65,6 +75,11 @@ class Definition:
     def between_impulses(self) -> Any:
         """The definition without its impulses: itself, where it has none."""
         return self
+
+    @property
+    def poles(self) -> Places | None:
+        """The places where H is infinite or not a number, over which steps may leap."""
+        return None
 
     def kicks(self, low: float, high: float, step: float) -> list[Any]:
         """The impulses within two times, in their order; `step` as of `jump_times`."""

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.arguments import check_number, check_positive, checked_states, floats, sample_count, vector
+from sympflow.arguments import check_number, check_positive, checked_states, floats, sample_count, told_of_all, vector
 from sympflow.arrays import Array, to_numpy
 from sympflow.hamiltonian.lattice_states import LatticeStates
 
@@ -33,6 +33,7 @@ class Domain(Protocol):
         """A description that `domain_from_dict` turns back into the domain."""
 
 
+@told_of_all
 @dataclass(frozen=True)
 class Ball:
     """The states within Euclidean distance `radius` of `center`.
@@ -70,6 +71,7 @@ class Ball:
         return {"kind": "Ball", **asdict(self)}
 
 
+@told_of_all
 @dataclass(frozen=True)
 class Box:
     """The states with low ≤ x ≤ high, componentwise.
@@ -116,6 +118,7 @@ class Box:
         return {"kind": "Box", **asdict(self)}
 
 
+@told_of_all
 @dataclass(frozen=True)
 class EnergySublevel:
     """The states of a box whose energy is below a bound: {x ∈ box : H(x) < energy}.
@@ -289,6 +292,7 @@ def _numbers(fields: dict[str, Any]) -> dict[str, Any]:
 _AT_ONCE = 2**20  # numbers in one block of distances
 
 
+@told_of_all
 @dataclass(frozen=True, eq=False)
 class Tube:
     """The states near an orbit: within `radius` of the broken line through its states.

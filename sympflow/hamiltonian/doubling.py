@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from sympflow.arguments import warn
-from sympflow.arrays import Array, as_tensor, concatenate, is_tensor, jacobian, of_library
+from sympflow.arrays import Array, as_tensor, concatenate, jacobian, library_name, of_library
 from sympflow.hamiltonian.domain import Box, Domain
 from sympflow.hamiltonian.system import HamiltonianSystem
 
@@ -130,7 +130,7 @@ def doubled(
         raise TypeError(f"`system` {system.name!r} is of a doubling: add the forces, and double what was doubled.")
     if force is None and system.conservative:
         raise TypeError("`force` is needed: a system without friction is Hamiltonian as it is.")
-    named = f"{system.name}_doubled" if name is None else name
+    named = (system.scene.name and f"{system.name}_doubled") if name is None else name
     scene: dict[str, Any] = {"name": named, "t_span": system.t_span, "dt": system.dt}
     scene["domain"] = _thin_box(system) if domain is None else domain
     scene["energy_scale"] = _energy_scale(system)
@@ -158,14 +158,13 @@ def doubled(
         F = SymbolicForce(system, [0] * system.ndof if force is None else force, params)
         if system.conservative and F.has_potential:
             warn(
-                "`force` is that of a potential, which keeps an energy: put it into H, and solve that system.",
+                "`force` derives from a potential, so that an energy is kept: put it into H, and solve that system.",
                 UserWarning,
             )
         time = None if system.symbols.time is None else {"time": system.symbols.time, "period": system.period}
         made = DoubledSystem.from_sympy(doubled_hamiltonian(system, F), **scene, **(time or {}))  # type: ignore[assignment]
     made.physical = system if force is None else system.with_force(F)
-    made.y0 = None if system.y0 is None else made.lift(system.y0)
-    return made
+    return made if system.y0 is None else made.with_scene(y0=made.lift(system.y0))  # type: ignore[return-value]
 
 
 class GivenForce:
@@ -177,10 +176,8 @@ class GivenForce:
         self.force = force
 
     def __call__(self, q: Array, p: Array, *t: Any) -> Array:
-        import torch
-
-        value = self.force(torch.as_tensor(q), torch.as_tensor(p))
-        got = tuple(value.shape) if is_tensor(value) else type(value).__name__
+        value = self.force(as_tensor(q), as_tensor(p))
+        got = tuple(value.shape) if library_name(value) == "torch" else type(value).__name__
         if got != tuple(p.shape):
             raise ValueError(
                 f"`force` must return a tensor of the shape of p, {tuple(p.shape)}; got {got}: write it with torch "

@@ -298,7 +298,7 @@ class _Reader:
         values, counts = zip(*(self.visit(a, depth) for a in node.args), strict=True) if node.args else ((), ())
         numbers = all(v.is_number for v in values)
         if name == "Rational" and not (values and all(v.is_Rational for v in values) and not values[-1].is_zero):
-            raise Unreadable("Rational is of whole numbers, as in Rational(1, 3)")
+            raise Unreadable("Rational takes whole numbers, as in Rational(1, 3)")
         if name in SPECIAL and numbers:
             if any(_magnitude(v) > MAX_ARGUMENT for v in values):
                 raise Unreadable(f"{_excerpt(node)} is out of range")
@@ -313,7 +313,7 @@ class _Reader:
         pieces = []
         for pair in node.args:
             if not (isinstance(pair, ast.Tuple) and len(pair.elts) == 2):
-                raise Unreadable("Piecewise is of pairs, as in Piecewise((q, q > 0), (0, True))")
+                raise Unreadable("Piecewise takes pairs, as in Piecewise((q, q > 0), (0, True))")
             pieces.append((self.visit(pair.elts[0], depth)[0], self._condition(pair.elts[1], depth)))
         if not pieces:
             raise Unreadable("Piecewise has no pieces")
@@ -346,7 +346,7 @@ def _literal(value: Any) -> sp.Expr:
 
 
 def _magnitude(number: sp.Expr) -> float:
-    """|x| of a number, which is refused if it is none that can be computed with."""
+    """|x| of a number; refuses a number that is not finite or not real."""
     if number.is_Rational and number.p == 0:
         return 0.0
     try:

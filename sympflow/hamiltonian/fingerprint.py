@@ -1,4 +1,4 @@
-"""Fingerprints and identities of systems, by which a trained flow knows its own."""
+"""Fingerprints and identities of systems: a trained flow recognises its own system by these."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def check_for_flows(system: Hamiltonian, takes_friction: bool = False, takes_dri
     """Refuse a system of which a flow would leave something out: friction, an external force, or the time."""
     if system.external_force is not None or not takes_friction:
         system.check_conservative(
-            "which trained flows have only where they are primed, with H = ½ pᵀM⁻¹p + V(q)",
+            "which only primed flows can have, with H = ½ pᵀM⁻¹p + V(q)",
             "fit such a flow by sympflow.train(system), or use a splitting method such as 'verlet' or 'kahan_li8', or "
             "a Runge–Kutta method such as 'dop853'",
         )
@@ -199,7 +199,7 @@ def _floats(values: Any, ndim: int) -> np.ndarray:
     try:
         return np.array([np.nan if v is None else v for v in values] if ndim == 1 else values, dtype=float)
     except (ValueError, OverflowError, TypeError):
-        raise ValueError("its numbers are no array of floats") from None
+        raise ValueError("its numbers are not an array of floats") from None
 
 
 def _energies(system: Hamiltonian, states: np.ndarray) -> np.ndarray:
@@ -212,7 +212,7 @@ def _energies(system: Hamiltonian, states: np.ndarray) -> np.ndarray:
 
 @lru_cache(maxsize=16)
 def _read(expression: str | None, ndof: int) -> Any:
-    """The H of a text in a file, read by a grammar and never executed; None if it is none of d degrees of freedom."""
+    """The H of a text in a file, read by a grammar and never executed; None unless it has d degrees of freedom."""
     from sympflow.hamiltonian.hamiltonian import Hamiltonian
     from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 

@@ -1,4 +1,4 @@
-"""Friction p' = −Γp, alone and with the drift q' = M⁻¹p: linear fields, of which the flows are exact."""
+"""Friction p' = −Γp, alone and with the drift q' = M⁻¹p: linear fields with exact flows."""
 
 from __future__ import annotations
 
@@ -54,6 +54,8 @@ class Friction:
 
     def drift(self, p: Array, s: Any) -> tuple[Array, Array]:
         """∫₀ˢ e^{−Γu}p du and e^{−Γs}p, for p (..., d) and times s: a number, or one that broadcasts against p."""
+        if not self:
+            return s * p, p
         rates = like(self.rates, p)
         mean, decay = _factors(rates, s)
         if self._modes is None:

@@ -235,7 +235,7 @@ def _differences(
 def _certainly_wrong(
     function: Callable[[Array], Array], x: Array, w: np.ndarray, claimed: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Mask of the claimed derivatives along w (N, m, …) that are none of the function, and the differences."""
+    """Mask of the claimed derivatives along w (N, m, …) that are wrong, and the differences."""
     small, large = STEPS[_precision(x)]
     floor = 10 * small if _precision(x) == np.float64 else 3 * small
     wrong = np.ones(claimed.shape, dtype=bool)

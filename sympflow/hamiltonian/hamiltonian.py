@@ -8,13 +8,25 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from sympflow.arrays import Array, concatenate, is_tensor, largest, library, like, of_library, per_state, to_numpy
+from sympflow.arrays import (
+    Array,
+    as_tensor,
+    concatenate,
+    is_tensor,
+    jvp,
+    largest,
+    library,
+    like,
+    of_library,
+    per_state,
+    to_numpy,
+)
 from sympflow.hamiltonian.definition import bare_copy
 from sympflow.hamiltonian.formulas import TracedHamiltonian, recorded
 from sympflow.hamiltonian.friction import FRICTIONLESS, Friction
 from sympflow.hamiltonian.linear_part import checked_inverse_mass
 from sympflow.hamiltonian.times import checked_time
-from sympflow.show.cards import Shown, cut
+from sympflow.show.cards import Shown
 
 if TYPE_CHECKING:
     from sympflow.compiler.program import Program
@@ -23,7 +35,6 @@ if TYPE_CHECKING:
     from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 
 
-UNNAMED = "custom"
 NEWTON, FOUND = 20, 1e-12  # steps at most, and the error of a velocity relative to the largest
 
 
@@ -71,7 +82,6 @@ class Hamiltonian:
     """
 
     friction: Friction = FRICTIONLESS
-    autonomous: bool = True
     period: float | None = None
     energy_scale: float | None = None
     followed_mass: Any = None
@@ -80,7 +90,7 @@ class Hamiltonian:
     """F(q, p, *t) of a physical limit, p' = −∂H/∂q + F, (..., d), with its `jacobian`; part of `vector_field`."""
 
     def __init__(self, name: str, definition: Any, inverse_mass: np.ndarray | None, quadratic_kinetic: bool) -> None:
-        self.name = name
+        self._name = name
         self.definition = definition
         self.symbols: Any = definition.symbols
         self.local: LocalHamiltonian | None = definition if definition.loops else None
@@ -94,14 +104,17 @@ class Hamiltonian:
         self.stiffness_matrix: np.ndarray | None = None
         self.functions_given: bool = definition.given
         self.numba_functions: Any = definition.numba_functions
-        self.autonomous = not definition.timed
         self._tested: dict[tuple[type, Any], np.ndarray] = {}  # how far, by the kind of states
 
     @property
-    def called(self) -> str:
-        """The name in messages; H of a formula without a name."""
-        unnamed = self.name == UNNAMED and self.symbols is not None
-        return repr(cut(f"H = {self.symbols.written[0]}", 60) if unnamed else self.name)
+    def autonomous(self) -> bool:
+        """False if H depends on t."""
+        return not self.definition.timed
+
+    @property
+    def name(self) -> str:
+        """The name that was given; else H as a formula, or the function of a user that defines it."""
+        return self._name or self.definition.name
 
     def hamiltonian(self, y: Array, t: Any = None) -> Array:
         """H(y), or H(t, y): (..., 2d) to (...); a TypeError, as of all functions, where t is missing."""
@@ -157,7 +170,7 @@ class Hamiltonian:
         self._check_width(y)
         if self.local is None:
             raise ValueError(
-                f"`system` {self.called} has no energy density: that is of lattices and pairs, by "
+                f"`system` {self.name!r} has no energy density: that is of lattices and pairs, by "
                 "HamiltonianSystem.lattice and HamiltonianSystem.pairs."
             )
         return self.local.energy_density(y, *self._time(t, y))
@@ -193,13 +206,14 @@ class Hamiltonian:
     def with_force(self, force: Any) -> Self:
         """Return the system with p' = −∂H/∂q − Γp + F(q, p), which its vector field, and no H, holds."""
         forced = bare_copy(self)
-        forced.name, forced.external_force = f"{self.name}_forced", force
+        forced._name = self._name and f"{self._name}_forced"
+        forced.external_force = force
         return forced
 
     def as_doubled(self) -> Any:
-        """Return the system itself if it is a doubled one; a ValueError if it is none."""
+        """Return the system itself if it is doubled; a ValueError otherwise."""
         raise ValueError(
-            f"`system` {self.called} is not doubled: its states are the physical ones: make one "
+            f"`system` {self.name!r} is not doubled, so that its states are the physical ones: make one "
             "by sympflow.doubled(system, force), or leave out what asks for its physical limit."
         )
 
@@ -208,12 +222,12 @@ class Hamiltonian:
         turned = y.ndim > 1 and len(y) == 2 * self.ndof
         remedy = "Transpose it" if turned else "Join q and p along the last axis, np.concatenate([q, p], axis=-1)"
         raise ValueError(
-            f"`y0` must have shape (..., {2 * self.ndof}) for {self.called}, [q, p] with {self.ndof} each; got "
+            f"`y0` must have shape (..., {2 * self.ndof}) for {self.name!r}, [q, p] with {self.ndof} each; got "
             f"{tuple(y.shape)}. {remedy}."
         )
 
     def identity_parts(self) -> Any:
-        """Return all that H and the equations of motion are made of, by which a store knows the system again."""
+        """Return all that H and the equations of motion are made of; a store recognises the system by it."""
         return [
             self.definition,
             self.inverse_mass,
@@ -250,17 +264,25 @@ class Hamiltonian:
         """
         if self.external_force is not None:
             raise ValueError(
-                f"`system` {self.called} has an external force, p' = −∂H/∂q + F, {what}: solve it by a "
+                f"`system` {self.name!r} has an external force, p' = −∂H/∂q + F, {what}: solve it by a "
                 "Runge–Kutta method such as 'dop853', or its doubled system by any method, and judge the physical "
                 "solution by sympflow.reference_error(sol)."
             )
         if self.friction:
-            raise ValueError(f"`system` {self.called} has friction, p' = −∂H/∂q − Γp, {what}: {remedy}.")
+            raise ValueError(f"`system` {self.name!r} has friction, p' = −∂H/∂q − Γp, {what}: {remedy}.")
+
+    def check_damped_drifts(self) -> None:
+        """Refuse friction of a kinetic energy that is not quadratic, whose drifts with friction are not known."""
+        if self.friction and not self.quadratic_kinetic:
+            raise ValueError(
+                f"`system` {self.name!r} has friction, which drifts hold where the kinetic energy is ½ pᵀM⁻¹p: use a "
+                "Runge–Kutta method such as 'dop853'."
+            )
 
     def check_autonomous(self, what: str, remedy: str) -> None:
         """Refuse a driven system, H(t, q, p), by a ValueError with `what` leaves the time out and the remedy."""
         if not self.autonomous:
-            raise ValueError(f"`system` {self.called} is driven, H depends on t, {what}: {remedy}.")
+            raise ValueError(f"`system` {self.name!r} is driven, H depends on t, {what}: {remedy}.")
 
     @property
     def shortest_piece(self) -> float:
@@ -286,13 +308,13 @@ class Hamiltonian:
         if form is self.definition:
             return self
         between = bare_copy(self)
-        Hamiltonian.__init__(between, self.name, form, self.inverse_mass, self.quadratic_kinetic)
+        Hamiltonian.__init__(between, self._name, form, self.inverse_mass, self.quadratic_kinetic)
         return between
 
     def check_impulses(self, what: str, remedy: str) -> None:
         """Refuse a system with impulses, DiracDelta in t, by a ValueError with `what` omits them and the remedy."""
         if self.between_impulses is not self:
-            raise ValueError(f"`system` {self.called} has impulses, DiracDelta in H, {what}: {remedy}.")
+            raise ValueError(f"`system` {self.name!r} has impulses, DiracDelta in H, {what}: {remedy}.")
 
     def check_times(self, t0: float, t1: float) -> None:
         """Refuse an interval that leaves the times of sampled parameters, by a ValueError with these."""
@@ -311,7 +333,7 @@ class Hamiltonian:
             )
         if t is None:
             raise TypeError(
-                f"`t` is missing, the time: `system` {self.called} is driven, H depends on t. Give it after the state, "
+                f"`t` is missing, the time: `system` {self.name!r} is driven, H depends on t. Give it after the state, "
                 "as in system.hamiltonian(y, t)."
             )
         return (checked_time(t, x, x.shape[:-1]),)
@@ -377,20 +399,14 @@ class Hamiltonian:
         if self.definition.has_third_derivative:
             return self.definition.third_derivative(q, v, w, *self._time(t, q))
         if self.numba_functions is None and (self.definition.differentiates_itself or is_tensor(q)):
-            import torch
-
-            from sympflow.arrays import jvp
-
-            x, along, other = (torch.as_tensor(each) for each in (q, v, w))
-            found = jvp(lambda z: self.hessian_vector(z, other, t), x, along)[1]
-            return of_library(found, q)
-
+            x, along, other = map(as_tensor, (q, v, w))
+            return of_library(jvp(lambda z: self.hessian_vector(z, other, t), x, along)[1], q)
         return third_derivative(self, q, v, w, t)
 
     def _with_acceleration(self) -> Hamiltonian:
         if not self._separable().quadratic_kinetic:
             raise ValueError(
-                f"`system` {self.called} has no curvature terms, which are for a kinetic energy ½ pᵀM⁻¹p: leave them "
+                f"`system` {self.name!r} has no curvature terms, which are for a kinetic energy ½ pᵀM⁻¹p: leave them "
                 "out."
             )
         return self
@@ -415,9 +431,9 @@ class Hamiltonian:
         """∇T(p): (..., d) to (..., d)."""
         if not self._separable().quadratic_kinetic:
             return self.definition.kinetic_gradient(p, *self._kinetic_time(t, p))
-        if self.followed_mass is not None and is_tensor(p):
-            mass = self.followed_mass.to(p)
-            return p / mass if mass.ndim < 2 else p @ mass.inverse().mT
+        if self.followed_mass is not None:
+            mass = like(of_library(self.followed_mass, p), p)
+            return p / mass if mass.ndim < 2 else p @ library(p).linalg.inv(mass).mT
         if self.inverse_mass is None:
             return p
         M = like(self.inverse_mass, p)
@@ -469,7 +485,7 @@ class Hamiltonian:
     def _separable(self) -> Hamiltonian:
         if not self.separable:
             raise ValueError(
-                f"`system` {self.called} is not separable: H does not split into T(p) + V(q), so splitting methods do "
+                f"`system` {self.name!r} is not separable: H does not split into T(p) + V(q), so splitting methods do "
                 f"not apply. Use {self.definition.instead}."
             )
         return self
@@ -513,7 +529,7 @@ class Hamiltonian:
         form = self.form
         if form is None:
             why = f"its functions could not be traced: {self.untraced}" if self.untraced else "it is given by one piece"
-            raise ValueError(f"`system` {self.called} has no program, for {why}.")
+            raise ValueError(f"`system` {self.name!r} has no program, for {why}.")
         times = () if form.time is None else (form.time,)
         return recorded([form.H], (*times, *form.q, *form.p))
 
@@ -537,7 +553,7 @@ class Hamiltonian:
 
     @property
     def few_sites(self) -> Self:
-        """A few of the sites of a lattice, by which a flow for any size knows it; else the system itself."""
+        """A lattice of a few sites, by which a flow for any size recognises it; else the system itself."""
         return self
 
     @property

@@ -18,6 +18,7 @@ import numpy as np
 import sympy as sp
 from sympy.core.relational import Relational
 
+from sympflow.hamiltonian.definition import ASIDE
 from sympflow.hamiltonian.driving import JUMP, MOST_TURNS, Samples, sampled, with_symbols
 from sympflow.hamiltonian.removable import triangle
 
@@ -29,6 +30,7 @@ MOST_POINTS = 2**20  # times at which a function that is neither a polynomial no
 MOST_IMPULSES = 1_000_000
 POINTS_A_PERIOD = 4096
 LONGEST_MULTIPLE = 64  # periods of a term that the common period of all may have
+TOUCHED = 1e-12  # share of the terms of a function, below which it vanishes where its slope does
 NEAR = 1e-3  # share of two places by which they differ, so that what jumps at one is constant at the other
 MOST_ROOTS = 64  # zeros in a state at which an expression is tried
 EPS = float(np.finfo(float).eps)
@@ -147,7 +149,7 @@ def _sides_of_quotient(a: sp.Function) -> Iterator[tuple[sp.Function, sp.Expr, s
 
 def _values(variables: list[sp.Symbol], expressions: list[sp.Expr]) -> Callable[..., np.ndarray]:
     """The expressions as a function of arrays (...) that returns (k, ...)."""
-    function = sp.lambdify(variables, expressions, ["scipy", "numpy"], cse=True)
+    function = sp.lambdify(variables, expressions, ["scipy", np], cse=True)
 
     def values(*columns: Any) -> np.ndarray:
         with np.errstate(all="ignore"):
@@ -423,6 +425,48 @@ class Switch:
             return found[(found > low) & (found < high) & (kinks or self.at_root)]
         found = self.zeros.within(low, high, step)
         return found[self._jumps(found, step)] if len(found) and not kinks else found
+
+
+class Touch:
+    """The double zeros of a function g of t, of which H has a root such as sqrt(1 - cos(t)): kinks, not jumps."""
+
+    at_root = False
+
+    def __init__(self, g: sp.Expr, time: sp.Symbol, samples: Mapping[str, Samples]) -> None:
+        self.g, self._turns = g, Zeros(sp.diff(g, time), time, samples)
+        terms, self._symbols = with_symbols([*sp.Add.make_args(g)])
+        self._terms = _values([time, *self._symbols.values()], terms)
+
+    def times(self, low: float, high: float, step: float, kinks: bool = False) -> np.ndarray:
+        """Return the times (n,) of `kinks`; `step` as of `Zeros.within`."""
+        if not kinks:
+            return np.zeros(0)
+        found = self._turns.within(low, high, step)
+        terms = self._values_at(found)
+        found = found[np.abs(terms.sum(0)) <= TOUCHED * np.abs(terms).max(0)]
+        near = ASIDE * max(abs(low), abs(high)) * np.linspace(-4, 4, 33)  # where rounding must not make g negative
+        beside = self._values_at((found + near[:, None]).ravel()).sum(0).reshape(len(near), len(found))
+        return found[(beside >= 0).all(0)]
+
+    def _values_at(self, t: np.ndarray) -> np.ndarray:
+        """The terms of g, (m, n) at times (n,)."""
+        turns = self._turns
+        return self._terms(t, *(_sampled_at(a, turns.time, turns.samples, t) for a in self._symbols))
+
+
+def touches(f: sp.Expr, time: sp.Symbol, samples: Mapping[str, Samples]) -> list[Touch]:
+    """The functions of t alone of which f has a root, and which may vanish without a change of sign."""
+    bases = [power.base for power in f.atoms(sp.Pow) if power.exp.is_integer is False]
+    bases += [g for a in f.atoms(sp.asin, sp.acos) for g in (1 - a.args[0], 1 + a.args[0])]
+    bases += [a.args[0] - 1 for a in f.atoms(sp.acosh)]
+    factors = {g for base in bases for g in sp.Mul.make_args(base) if g.is_Add and g.free_symbols == {time}}
+    found = [Touch(g, time, samples) for g in sorted(factors, key=str) if not g.is_positive]
+    periods = [common_period(each.g, time) for each in found]
+    return [
+        each
+        for each, period in zip(found, periods, strict=True)
+        if period is None or len(each.times(0, 2 * period, period, kinks=True))
+    ]
 
 
 def _sampled_at(a: sampled, time: sp.Symbol, samples: Mapping[str, Samples], t: np.ndarray) -> np.ndarray:

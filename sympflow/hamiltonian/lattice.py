@@ -150,7 +150,7 @@ class LatticeHamiltonian(LocalHamiltonian):
         from scipy.optimize import minimize
 
         values = {s: float(np.mean(v)) for s, v in zip(self.c, self.params.values(), strict=True)}
-        U = sp.lambdify([self.x], self.U.xreplace(values), "numpy")
+        U = sp.lambdify([self.x], self.U.xreplace(values), np)
         starts = [np.zeros(n), *rng.uniform(-3, 3, (WELLS * n, n))]
         lines = np.concatenate([np.eye(n), -np.eye(n), rng.standard_normal((LINES * (n - 1), n))])
         lines /= np.linalg.norm(lines, axis=1, keepdims=True)
@@ -301,7 +301,7 @@ class LatticeHamiltonian(LocalHamiltonian):
         for i in range(len(self.p)):
             used = sorted(M[i, i].free_symbols, key=str)
             with np.errstate(all="ignore"):
-                value = sp.lambdify(used, M[i, i], "numpy")(*(values[s] for s in used))
+                value = sp.lambdify(used, M[i, i], np)(*(values[s] for s in used))
             columns.append(np.broadcast_to(np.asarray(value, dtype=float), self.shape).ravel())
         inverse_mass = np.concatenate(columns)
         if not np.isfinite(inverse_mass).all() or not (inverse_mass != 0).all():

@@ -194,7 +194,7 @@ class Rest:
         return np.broadcast_to(fields.mean(-1, keepdims=True), fields.shape).reshape(v.shape)
 
     def drawn(self, n: int, bounds: tuple[float, float], rng: np.random.Generator) -> np.ndarray:
-        """States (n, 2d), of which some may be far beyond the bounds, or not finite."""
+        """States (n, 2d); some may be far beyond the bounds, or not finite."""
         system, d = self.system, self.system.ndof
         energy = self.parts * rng.uniform(*bounds, n) * rng.gamma(d, 1 / d, n)
         rest = self.positions[rng.integers(len(self.positions), size=n)]

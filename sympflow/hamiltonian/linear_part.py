@@ -222,7 +222,7 @@ def linear_part(system: Any) -> LinearPart:
         part = read_off(system.written.H, system.written.q, system.written.p, _interval(system))
     else:
         raise ValueError(
-            f"`system` {system.name!r} is given by functions, from which no linear part can be read: pass "
+            f"`system` {system.name!r} is given by functions, whose linear part is not known: pass "
             "stiffness_matrix=K to Hamiltonian."
         )
     if system.quadratic_kinetic and (reason := turning(system, part)):

@@ -85,7 +85,7 @@ def _signs(d: int) -> Iterator[tuple[int, ...]]:
 
 
 def in_monomials(f: Any, symbols: SymbolicHamiltonian, of: Monomials) -> np.ndarray | None:
-    """The coefficients (M,) of an expression in q that is such a polynomial, up to a constant; None if it is none."""
+    """The coefficients (M,) of such a polynomial in q, up to a constant; None for other expressions."""
     import sympy as sp
 
     if not f.is_polynomial(*symbols.q):

@@ -13,7 +13,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 import sympy as sp
 
-from sympflow.arrays import differentiable, expanded, is_tensor, to_numpy, transformed
+from sympflow.arrays import differentiable, expanded, transformed, without_torch
 from sympflow.hamiltonian.scales import size_of_terms
 from sympflow.hamiltonian.symbolic import exact, generate, printable
 from sympflow.hamiltonian.system import HamiltonianSystem
@@ -216,6 +216,8 @@ def checked_rows(system: HamiltonianSystem, params: Any, batch: tuple[int, ...])
         raise TypeError(f"`params` must be a mapping of names to numbers or arrays; got {type(params).__name__}.")
     if not params:
         raise ValueError("`params` is empty: give values for parameters of the system, or leave it out.")
+    if system.local is not None:
+        params = system.local.number_columns(params)
     system.check_parameters(params)
     arrays = {name: _checked_values(name, value) for name, value in params.items()}
     try:
@@ -233,13 +235,12 @@ def checked_rows(system: HamiltonianSystem, params: Any, batch: tuple[int, ...])
 
 
 def _checked_values(name: str, given: Any) -> np.ndarray:
-    if is_tensor(given):
-        if transformed(given):
-            raise TypeError(
-                f"`params` has {name} that torch.func, forward mode or torch.compile follows, which solve does not "
-                "take: use torch.autograd.grad, or detach it."
-            )
-        given = to_numpy(given)
+    if transformed(given):
+        raise TypeError(
+            f"`params` has {name} that torch.func, forward mode or torch.compile follows, which solve does not "
+            "take: use torch.autograd.grad, or detach it."
+        )
+    given = without_torch(given)
     try:
         array = np.asarray(given)
         if array.dtype.kind not in "iuf":

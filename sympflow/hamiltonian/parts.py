@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sympflow.arrays import Array, concatenate, detached, is_tensor, library, like, stack
+from sympflow.arrays import Array, concatenate, detached, library, like, stack
 from sympflow.hamiltonian.linear_part import (
     LinearPart,
     RestOfPotential,
@@ -263,7 +263,7 @@ def shears(kinds: Sequence[str], rates: Array, s: Array) -> tuple[Array, Array, 
     """
     module = library(s)
     theta = rates * s
-    k, r = _reduced(theta, 0.0 if is_tensor(s) else _low(rates, s, theta), module)
+    k, r = _reduced(theta, _low(rates, s, theta), module)
     one, zero = 1 + 0 * theta, 0 * theta
     c = module.where(k == 0, one, zero) - module.where(abs(k) == 2, one, zero)
     d = module.where(k == 1, one, zero) - module.where(k == -1, one, zero)
@@ -303,15 +303,16 @@ def _reduced(theta: Array, low: Any, module: Any) -> tuple[Array, Array]:
     return k, module.where(none, r - detached(r), r)
 
 
-def _low(a: np.ndarray, b: np.ndarray, product: np.ndarray) -> np.ndarray:
+def _low(a: Array, b: Array, product: Array) -> Array:
     """The part that rounding took from the product a·b, exactly [Dekker 1971]; 0 where it overflows, or in float32."""
-    if product.dtype != np.float64:
-        return np.zeros_like(product)
+    xp = library(product)
+    if product.dtype != xp.float64:
+        return xp.zeros_like(product)
     with np.errstate(all="ignore"):
         a_high, b_high = (SPLITTER * x - (SPLITTER * x - x) for x in (a, b))
         a_low, b_low = a - a_high, b - b_high
         low = ((a_high * b_high - product) + a_high * b_low + a_low * b_high) + a_low * b_low
-    return np.where(np.isfinite(low), low, 0.0)
+    return xp.where(xp.isfinite(low), low, 0.0)
 
 
 @kept
@@ -335,7 +336,7 @@ def exact_parts(system: HamiltonianSystem, expressions: Sequence[str] | None = N
     by_arrays = system.local is not None or (system.stiffness_matrix is not None and expressions is None)
     if system.written is None or by_arrays:
         if expressions is not None:
-            raise ValueError("`parts` are read as symbols, which the system has not: define it with from_sympy.")
+            raise ValueError("`parts` are read as symbols, and the system has none: define it with from_sympy.")
         if system.local is not None:
             local, rest = system.local.linear_and_rest(abs(system.t_span[1] - system.t_span[0]))
             return ExactParts(local, rest, system.ndof)
@@ -436,7 +437,7 @@ def _parsed(expression: str, system: HamiltonianSystem) -> sp.Expr:
         raise ValueError(f"`parts` has one that is not admissible: {error}") from None
     known = {s.name for s in (*symbols.q, *symbols.p)} | {"q", "p", getattr(time, "name", "q")}
     if foreign := {s.name for s in part.free_symbols} - known:
-        raise ValueError(f"`parts` has {', '.join(sorted(foreign))}, which the system has not: leave it out.")
+        raise ValueError(f"`parts` has {', '.join(sorted(foreign))}, which the system does not have: leave it out.")
     first = {"q": symbols.q[0], "p": symbols.p[0]}
     return part.xreplace({s: first[s.name] for s in part.free_symbols if s.name in first})
 
@@ -530,7 +531,7 @@ def both(y: Array, d: int) -> Array:
 
 
 def mean(x: Array, d: int) -> Array:
-    """The mean of the two copies, in which their difference cancels to first order: (..., 4d) to (..., 2d)."""
+    """The mean of the two copies, (..., 4d) to (..., 2d): their difference cancels to first order."""
     return concatenate([(x[..., :d] + x[..., d : 2 * d]) / 2, (x[..., 2 * d : 3 * d] + x[..., 3 * d :]) / 2])
 
 

@@ -52,7 +52,7 @@ def gravity(units: Any) -> float:
     for name, table in zip(names, tables, strict=True):
         if not isinstance(name, str) or name not in table:
             raise ValueError(
-                f"`units` has {name!r}, which is none of {', '.join(map(repr, table))}: take one of these."
+                f"`units` has {name!r}, but the units are {', '.join(map(repr, table))}: take one of these."
             )
     length, time, mass = (table[name] for name, table in zip(names, tables, strict=True))
     return mass * time**2 / length**3
@@ -241,7 +241,7 @@ class Frame:
         return (d * d).sum(-1) < like(self.limits, d)
 
     def check(self, method: str) -> None:
-        """Raise a ValueError where some body is no planet of the star: bound to another one, or not bound at all."""
+        """Raise a ValueError where some body is not a planet of the star: bound to another one, or not bound at all."""
         masses = self.masses
         if masses[1:].max() >= masses[0]:
             i = 1 + int(np.argmax(masses[1:]))
@@ -519,7 +519,7 @@ def checked_planets(masses: Any, elements: Any, y0: Any, G: Any, units: Any) -> 
             "first, or make the system by HamiltonianSystem.pairs."
         )
     if (elements is None) == (y0 is None):
-        raise ValueError("`elements` or `y0` must be given, one of them: the orbits, or the state [q, p].")
+        raise ValueError("`elements` or `y0` must be given, and not both: the orbits, or the state [q, p].")
     if y0 is None:
         y0 = placed(masses, G, _checked_elements(elements, len(masses) - 1))
     y0 = np.array(to_numpy(y0), dtype=float)
@@ -534,9 +534,7 @@ def _checked_elements(elements: Any, n: int) -> np.ndarray:
         unknown = [name for name in elements if name not in ELEMENTS]
         if unknown or "a" not in elements:
             what = f"has {unknown[0]!r}" if unknown else "must have 'a'"
-            raise ValueError(
-                f"`elements` {what}: the names are {', '.join(ELEMENTS)}, of which all but a are 0 by default."
-            )
+            raise ValueError(f"`elements` {what}: the names are {', '.join(ELEMENTS)}; all but a are 0 by default.")
         columns: Any = [elements.get(name, 0.0) for name in ELEMENTS]
     else:
         columns = ()

@@ -18,6 +18,7 @@ MOST_SHOWN = 100  # characters of terms
 DIGITS, HALVINGS = 50, 100  # of the arithmetic in which H is judged beside such a place, and of the way to it
 BESIDE = 1e-3, 1e-6, 1e-9
 """Distances from a place, in parts of a step, at which H is compared: of a finite one the differences decrease."""
+AIMED = 1e-12  # share of the square of a distance below which that of the closest approach is 0
 MOST_MET = 16  # pairs that changed their cells in a step, which are looked at
 DECREASES = 0.7  # by less, of the second difference to the first, where H is infinite: by 1 of a logarithm
 
@@ -58,8 +59,8 @@ class Cancelling(NamedTuple):
         return float(np.nanmax(error) / np.nanmedian(size))
 
 
-class Poles(Protocol):
-    """The places at which H of a system may be infinite, in columns."""
+class Places(Protocol):
+    """The places at which H of a system may be infinite, in columns, as runs look at them."""
 
     cancelling: Sequence[Cancelling]  # terms of H that cancel where each is infinite
     watched: bool  # False if H has cancelling terms alone
@@ -70,7 +71,6 @@ class Poles(Protocol):
     @property
     def exact(self) -> Poles | None:
         """The places by which runs are judged, where these may have passed one; None if they are not known."""
-        return self
 
     def may_pass(self, y: np.ndarray) -> bool:
         """Return False if runs between states y (2, N, 2d) passed no place; True where more is to be looked at."""
@@ -88,8 +88,20 @@ class Poles(Protocol):
         """The values (..., m) that vanish at the places by which H is judged."""
         return np.empty((*y.shape[:-1], 0))
 
+
+class Poles(Places, Protocol):
+    """Such places that are known exactly."""
+
+    @property
+    def exact(self) -> Poles | None:
+        return self
+
+    def ahead(self, y: np.ndarray) -> np.ndarray:
+        """True (N,) for states (N, 2d) from which a free flight meets a place, or may."""
+        return np.ones(len(y), dtype=bool)
+
     def passed(self, column: int, t: Sequence[float], y: np.ndarray) -> bool:
-        """Return True if H is infinite, or no number, on the way between states y (2, 2d) in two cells."""
+        """Return True if H is infinite or not a number on the way between states y (2, 2d) in two cells."""
 
     def name(self, column: int) -> str:
         """The place, in words that go before "passed"."""
@@ -113,7 +125,9 @@ class SymbolicPoles(Poles):
         T = symbols.T if symbols.separable else sp.Add(*[sp.Abs(s * sp.diff(symbols.H, s)) for s in letters])
         cells = [sp.S.Zero if place.g.is_nonnegative else place.cell for place, _ in self._places]
         self._look = symbols.evaluated("cells", [*cells, symbols.H, T])
-        self._sizes = symbols.evaluated("sizes", [place.g for place, _ in self._places])
+        states = {*symbols.q, *symbols.p}  # a place in t alone is crossed, or met by none of the steps
+        sizes = [place.g if place.g.free_symbols & states else sp.S.One for place, _ in self._places]
+        self._sizes = symbols.evaluated("sizes", sizes)
 
     def look(self, y: np.ndarray, t: Any, numbers: Sequence[Any] = ()) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         values = self._look(y, *self._time(y, t), numbers=numbers)
@@ -121,6 +135,17 @@ class SymbolicPoles(Poles):
 
     def sizes(self, y: np.ndarray, t: Any) -> np.ndarray:
         return self._sizes(y, *self._time(y, t))
+
+    def ahead(self, y: np.ndarray) -> np.ndarray:
+        if not all(place.g.is_nonnegative for place, _ in self._places):
+            return super().ahead(y)
+        q, v = y[:, : self._symbols.ndof], self._symbols.gradient(y)[:, self._symbols.ndof :]
+        duration = np.abs(q).max(1, keepdims=True) / np.maximum(np.abs(v).max(1, keepdims=True), 1e-300)
+        on_the_way = [np.concatenate([q + s * duration * v, y[:, self._symbols.ndof :]], axis=1) for s in (-1, 0, 1)]
+        before, now, after = (self.sizes(x, 0.0) for x in on_the_way)
+        slope, bend = (after - before) / 2, (after + before) / 2 - now  # of a square of a distance
+        least = now * bend - slope**2 / 4
+        return ((bend > 0) & (np.abs(least) <= AIMED * np.abs(now * bend))).any(-1)
 
     def passed(self, column: int, t: Sequence[float], y: np.ndarray) -> bool:
         place, f = self._places[column]
@@ -236,6 +261,9 @@ class PairsPoles(Poles):
     def may_pass(self, y: np.ndarray) -> bool:
         return not self._only_meet or self._pairs.may_pass(y)
 
+    def ahead(self, y: np.ndarray) -> np.ndarray:
+        return np.array([self.may_pass(state) for state in y])
+
     def look(self, y: np.ndarray, t: Any, numbers: Sequence[Any] = ()) -> tuple[np.ndarray, np.ndarray, None]:
         q, end = y[..., : self._pairs.ndof], self._pairs.cutoff
         sums = np.zeros((*y.shape[:-1], len(self._places)))
@@ -326,7 +354,7 @@ _ODD = sp.sinh, sp.tanh, sp.asinh, sp.atan, sp.erf, sp.sign
 
 @lru_cache(maxsize=64)
 def places(f: sp.Expr, x: tuple[sp.Symbol, ...]) -> tuple[Place, ...]:
-    """The places where f may be infinite or no number, for all that can be told from it, by letters of x."""
+    """The places where f may be infinite or not a number, as far as they are found, by letters of x."""
     return tuple(place for place in _places(f, x) if _removable(f, place) is None)
 
 
@@ -511,4 +539,4 @@ def _precise(f: sp.Expr, cell: sp.Expr, letters: tuple[sp.Symbol, ...]) -> tuple
 def _slopes(f: sp.Expr, s: sp.Symbol) -> tuple[Any, Any]:
     """The derivative of f in double precision, and in the arithmetic of mpmath."""
     slope = sp.diff(f, s).replace(sp.DiracDelta, lambda *_: sp.S.Zero)
-    return tuple(sp.lambdify(s, slope, modules) for modules in (["scipy", "numpy"], [_BOUNDED, "mpmath"]))
+    return tuple(sp.lambdify(s, slope, modules) for modules in (["scipy", np], [_BOUNDED, "mpmath"]))

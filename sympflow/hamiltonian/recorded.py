@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial, reduce
 from operator import add
 from typing import Any
@@ -13,7 +13,7 @@ from sympy.core.relational import Relational
 
 from sympflow.compiler import NotCompiled, arrays_only
 from sympflow.compiler.functions import MOST_DERIVATIVES, apply, where
-from sympflow.compiler.program import Program, Traced
+from sympflow.compiler.program import Program, Traced, traced
 from sympflow.hamiltonian.removable import (
     Max,
     Min,
@@ -124,7 +124,7 @@ def check_recorded(f: sp.Expr) -> None:
     """Raise a ValueError with the term of an expression of which `calculated` has no rule for a function."""
     for term in sp.Add.make_args(f):
         if not can_be_recorded(term):
-            raise arrays_only(f"`system` has the term {term}, for which there is no compiled function")
+            raise arrays_only(f"`system` has the term {term}, and there is no compiled function for it")
 
 
 def calculated(f: sp.Basic, value: Callable[[sp.Basic], Any]) -> Any:
@@ -152,6 +152,22 @@ def calculated(f: sp.Basic, value: Callable[[sp.Basic], Any]) -> Any:
     if rule is None:
         raise NotRecorded(f"{f.func.__name__} is in no table of the compiler.")
     return rule(*(value(x) for x in f.args))
+
+
+def recorded(f: sp.Expr, variables: Sequence[sp.Symbol]) -> Program:
+    """An expression as a program of variables; NotRecorded where a function has no rule."""
+
+    def output(*numbers: Any) -> list[Any]:
+        known: dict[sp.Basic, Any] = dict(zip(variables, numbers, strict=True))
+
+        def value(part: sp.Basic) -> Any:
+            if part not in known:
+                known[part] = calculated(part, value)
+            return known[part]
+
+        return [value(f)]
+
+    return traced(output, *(s.name for s in variables))
 
 
 def in_symbols(program: Program) -> sp.Expr:

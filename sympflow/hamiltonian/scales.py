@@ -179,7 +179,8 @@ def started(system: Any, y0: np.ndarray) -> Any:
 @lately_kept
 def _started(system: Any, dt: float, y0: bytes) -> Any:
     other = bare_copy(system)
-    other.dt, other.y0 = dt, np.frombuffer(y0).copy()
+    other._dt = dt
+    other._y0 = np.frombuffer(y0).copy()
     return other
 
 

@@ -8,6 +8,7 @@ import re
 import reprlib
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property, partial, reduce
 from itertools import islice
@@ -22,7 +23,10 @@ from sympy.printing.codeprinter import PrintMethodNotImplementedError
 
 from sympflow.arguments import check_kept, plain
 from sympflow.arrays import Array, assemble, beside, concatenate, library_name
+from sympflow.compiler import NotCompiled
 from sympflow.compiler.functions import apply
+from sympflow.compiler.program import Program
+from sympflow.compiler.program import gradient as slopes
 from sympflow.hamiltonian.definition import Definition
 from sympflow.hamiltonian.driving import (
     DURATION,
@@ -40,19 +44,24 @@ from sympflow.hamiltonian.jumps import (
     MOST_POINTS,
     Impulse,
     Switch,
+    Touch,
     Zeros,
     borders,
     check_continuous,
     has_period,
     refuse_deltas,
     split_impulses,
+    touches,
 )
 from sympflow.hamiltonian.poles import Poles, SymbolicPoles
+from sympflow.hamiltonian.recorded import recorded
 from sympflow.hamiltonian.removable import BOUNDED, Max, sinc
+from sympflow.show.cards import cut
 
 LARGEST, TINY = sys.float_info.max, 1e-150
 MOST_LEFT_OUT = 100  # degrees of freedom up to the last one that a formula may do without
 LONGEST_NAME = 40  # in messages
+MOST_WRITTEN = 16  # variables of a Hessian whose entries are written out
 MOST_COORDINATES = 10_000  # degrees of freedom of an H that is written out
 FAR = 1000.0
 """The time before and after 0 in which it is looked if H jumps, where that is at no zeros of linear functions."""
@@ -95,6 +104,8 @@ class SymbolicHamiltonian(Definition):
     parameters: tuple[sp.Symbol, ...] = ()
     values: tuple[float, ...] = ()
     meanings: tuple[sp.Expr, ...] = ()
+    left_out: sp.Expr = sp.S.Zero
+    """The terms of H without coordinates, in its parameters, which a form does not have."""
     _written: tuple[sp.Expr, dict[sp.Symbol, sp.Expr]] | None = None
     """H as it was written, and the values of its parameters; None without any."""
     time: Any = None
@@ -130,7 +141,7 @@ class SymbolicHamiltonian(Definition):
             raise ValueError("`expression` must depend on q1 … qd and p1 … pd (or q and p).")
         if ndof - len(used) > MOST_LEFT_OUT:
             raise ValueError(
-                f"`expression` has coordinates of the number {str(ndof)[:20]}, and depends on {len(used)} degrees of "
+                f"`expression` has coordinates numbered up to {str(ndof)[:20]}, and depends on {len(used)} degrees of "
                 "freedom: number them from 1, q1 … qd and p1 … pd."
             )
         if ndof > MOST_COORDINATES:
@@ -188,7 +199,10 @@ class SymbolicHamiltonian(Definition):
         except (TypeError, OverflowError):  # a value that is no real number
             return self
         states = {*self.q, *self.p}
-        form = self.like(sp.Add(*[term for term in sp.Add.make_args(H) if term.free_symbols & states]))
+        terms = sp.Add.make_args(H)
+        form = self.like(sp.Add(*[term for term in terms if term.free_symbols & states]))
+        constant = sp.Add(*[term for term in terms if not term.free_symbols & states])
+        form.left_out = constant.xreplace({symbol: part for part, (symbol, _) in symbols.found.items()})
         used = form.H.free_symbols - states - {self.time}
         kept = [(part, *symbol) for part, symbol in symbols.found.items() if symbol[0] in used]
         form.meanings, form.parameters, form.values = (tuple(row[i] for row in kept) for i in range(3))
@@ -208,15 +222,41 @@ class SymbolicHamiltonian(Definition):
             H = written.xreplace({s: symbols.get(s.name, value) for s, value in values.items()})
             states = {*self.q, *self.p}
             form = self.like(sp.Add(*[term for term in sp.Add.make_args(H) if term.free_symbols & states]))
-            known = {s.name: s for s in values}
-            form.parameters, form.meanings = tuple(symbols.values()), tuple(known[name] for name in names)
-            form.values = tuple(float(values[s]) for s in form.meanings)
+            meanings = [sp.Symbol(name, real=True) for name in names]
+            form.parameters, form.meanings = tuple(symbols.values()), tuple(meanings)
+            form.values = tuple(float(values.get(s, 0.0)) for s in meanings)  # 0 of one that H does not have
             self._named[key] = form
         return self._named[key]
 
     @cached_property
     def _named(self) -> dict[tuple[str, ...], SymbolicHamiltonian]:
         return {}
+
+    @cached_property
+    def name(self) -> str:
+        return cut(f"H = {self.written[0]}", 60)
+
+    def revalued(self, params: Mapping[str, float]) -> Revalued | None:
+        """The same H with other values of its parameters, by the functions and the code of this one.
+
+        None where H may have another structure with these, which is then to be found anew.
+        """
+        form, (written, before) = self.parametric, self.written
+        if form is self or self.time is not None or self.impulses:
+            return None
+        values = {s: exact(params[s.name]) for s in before}
+        parts, replaced = self.parametric_parts
+        changed = {s for s, value in values.items() if value != before[s]}
+        lasting = [part for part in parts if part not in form.meanings]
+        if changed & replaced or any(part.free_symbols & changed for part in lasting):
+            return None
+        try:
+            numbers = tuple(float(part.xreplace(values)) for part in form.meanings)
+        except (TypeError, OverflowError):  # a value that is no real number
+            return None
+        if any(not math.isfinite(x) or x in (0, 1, -1) for x in numbers):
+            return None
+        return Revalued(self, form, written, values, numbers)
 
     @property
     def written(self) -> tuple[sp.Expr, dict[sp.Symbol, sp.Expr]]:
@@ -235,13 +275,18 @@ class SymbolicHamiltonian(Definition):
         return self
 
     @property
+    def structure(self) -> SymbolicHamiltonian:
+        """H with the values with which it was first given: what does not depend on these is asked of it, once."""
+        return self
+
+    @property
     def timed(self) -> bool:  # type: ignore[override]
         return self.time is not None
 
     @cached_property
     def kinetic_timed(self) -> bool:  # type: ignore[override]
         """True if T depends on the time."""
-        return self.T is not None and self.time in self.T.free_symbols
+        return self.time is not None and self.T is not None and self.time in self.T.free_symbols
 
     @cached_property
     def shortest_piece(self) -> float:  # type: ignore[override]
@@ -259,15 +304,16 @@ class SymbolicHamiltonian(Definition):
         return bool(self.samples or self._switches)
 
     @cached_property
-    def _switches(self) -> list[Switch]:
-        """Borders at which H may jump in t alone."""
+    def _switches(self) -> list[Switch | Touch]:
+        """Places at which H may jump, or have a kink, in t alone."""
         if self.time is None:
             return []
         own = [border for border in borders(self.H, [self.time], kinks=True) if border.g.free_symbols == {self.time}]
-        return [Switch(border, self.time, self.samples) for border in own]
+        jumping = [Switch(border, self.time, self.samples) for border in own]
+        return [*jumping, *touches(self.H, self.time, self.samples)]
 
     def jump_times(self, low: float, high: float, step: float, kinks: bool = False) -> np.ndarray:
-        found = [samples.jump_times(low, high) for samples in self.samples.values()]
+        found = [samples.jump_times(low, high, kinks) for samples in self.samples.values()]
         found += [each.times(low, high, step, kinks) for each in self._switches]
         times = np.unique(np.concatenate(found)) if found else np.zeros(0)
         return times[np.diff(times, prepend=-np.inf) > 8 * sys.float_info.epsilon * np.abs(times)]
@@ -407,14 +453,22 @@ class SymbolicHamiltonian(Definition):
             f, x = getattr(self, name), self._variables(name)
             return [f] if order == 0 else gradient(f, x) if order == 1 else list(hessian(f, x))
 
-        return self._function(name + "'" * order, expressions, (_single, assemble, _square)[order])
+        key, n = name + "'" * order, len(self._variables(name))
+        if order == 2 and n > MOST_WRITTEN:
+            return self._function(key, lambda: [getattr(self, name)], _square, partial(_hessian_by_program, n))
+        return self._function(key, expressions, (_single, assemble, _square)[order])
 
     def _function(
-        self, key: str, expressions: Callable[[], list[sp.Expr]], collect: Callable[[Sequence[Array], Array], Array]
+        self,
+        key: str,
+        expressions: Callable[[], list[sp.Expr]],
+        collect: Callable[[Sequence[Array], Array], Array],
+        make: Callable[..., Callable[..., list[Any]]] | None = None,
     ) -> Callable[..., Array]:
-        """A function of an array (..., n), and of the time, generated for NumPy or torch when first called with one."""
+        """A function of an array (..., n), and of the time, made for NumPy or torch when first called with one."""
         if key in self._functions:
             return self._functions[key]
+        make = generate if make is None else make
         name = key.rstrip("'")
         variables = self._variables(name)
         n, timed = len(variables), self.kinetic_timed if name in ("T", "drift") else self.timed
@@ -427,7 +481,7 @@ class SymbolicHamiltonian(Definition):
             if library not in generated:
                 wanted, sample_symbols = with_symbols([printable(f) for f in expressions()])
                 values_of_samples[:] = [(a, sp.lambdify(moving, a.at, modules=[])) for a in sample_symbols]
-                generated[library] = generate(
+                generated[library] = make(
                     wanted, (*variables, *moving, *self.parameters, *sample_symbols.values()), library
                 )
             columns = [x[..., i] for i in range(n)]
@@ -446,11 +500,90 @@ class SymbolicHamiltonian(Definition):
         self._functions[key] = function
         return function
 
-    _generated = ("_functions", "_switches", "poles")
+    _generated: tuple[str, ...] = ("_functions", "_switches", "poles")
 
     @cached_property
     def _functions(self) -> dict[str, Callable[[Array], Array]]:
         return {}
+
+
+class Revalued(SymbolicHamiltonian):
+    """H with other values of parameters: they are numbers of functions that are generated once for all of them.
+
+    H, V and T with these values are made when they are first asked for, as few runs do.
+    """
+
+    def __init__(
+        self,
+        like: SymbolicHamiltonian,
+        form: SymbolicHamiltonian,
+        written: sp.Expr,
+        values: dict[sp.Symbol, sp.Expr],
+        numbers: tuple[float, ...],
+    ) -> None:
+        self.ndof, self.q, self.p, self.separable = like.ndof, like.q, like.p, like.separable
+        self._root: SymbolicHamiltonian = like.structure
+        self._written = written, values
+        self._form = copy(form)
+        self._form.values, self._form._functions, self._form.inverse_mass = numbers, form._functions, form.inverse_mass
+
+    @property
+    def parametric(self) -> SymbolicHamiltonian:
+        return self._form
+
+    @property
+    def structure(self) -> SymbolicHamiltonian:
+        return self._root
+
+    @cached_property
+    def H(self) -> sp.Expr:
+        written, values = self.written
+        return _with_numeric_constants(_valued(written, values, None))
+
+    @cached_property
+    def _parts(self) -> tuple[Any, Any]:
+        return _split(self.H, self.q, self.p)
+
+    @property
+    def V(self) -> Any:
+        return self._parts[0]
+
+    @property
+    def T(self) -> Any:
+        return self._parts[1]
+
+    @cached_property
+    def inverse_mass(self) -> Any:
+        M = self._form.inverse_mass
+        return M if M is None or not M.free_symbols else M.xreplace(dict(zip(*self._letters, strict=True)))
+
+    @property
+    def _letters(self) -> tuple[Sequence[sp.Symbol], Sequence[sp.Expr]]:
+        return self._form.parameters, [*map(sp.Float, self._form.values)]
+
+    @property
+    def poles(self) -> Poles | None:
+        return self._own_poles if self._root.poles else None
+
+    @cached_property
+    def _own_poles(self) -> Poles:
+        return SymbolicPoles(self)
+
+    @cached_property
+    def _left_out(self) -> float:
+        return float(self._form.left_out.xreplace(self.written[1]))
+
+    def _derivative(self, name: str, order: int) -> Callable[..., Array]:
+        function, numbers = self._form._derivative(name, order), self._form.values
+        constant = self._left_out if order == 0 and name in ("H", "V") else 0.0
+
+        def derivative(x: Array, *t: Array, **_: Any) -> Array:
+            value = function(x, *t, numbers=numbers)
+            return value + constant if constant else value
+
+        return derivative
+
+    _generated = (*SymbolicHamiltonian._generated, "_own_poles")
 
 
 def _single(values: Sequence[Array], like: Array) -> Array:
@@ -463,6 +596,7 @@ def _square(values: Sequence[Array], like: Array) -> Array:
     return flat.reshape(*flat.shape[:-1], n, n)
 
 
+VELOCITY_LIKE = re.compile(r"(d(q|x|y|z|r|theta|phi)|\w+_?dot|qd)\d*")
 COORDINATE_LIKE = re.compile(r"[pqv]?[xyzr]\d?|[PQX]\d*|v|[pq]_?\w|[vpq]?_?(theta|phi)\d?")
 """Names of parameters that are coordinates elsewhere."""
 
@@ -576,6 +710,11 @@ def _valued(H: sp.Expr, values: Mapping[sp.Symbol, sp.Expr], time: sp.Symbol | N
                 " Coordinates are q and p, or q1 … qd and p1 … pd: other names are given by "
                 "from_sympy(H, q=['x', 'y'], p=['px', 'py'])."
             )
+        if velocity := next((name for name in unknown if VELOCITY_LIKE.fullmatch(name)), ""):
+            meant += (
+                f" H is a function of momenta: if {velocity} is a velocity q', write p, which is ∂L/∂q', such as m*q',"
+                " in its place."
+            )
         raise ValueError(f"`expression` holds {', '.join(shown)} without a value: give it in `params`.{meant}")
     return H
 
@@ -591,7 +730,7 @@ def _check_values(H: sp.Expr, values: Mapping[sp.Symbol, sp.Expr]) -> None:
     numbers = [abs(a) for a in H.atoms(sp.Number)]
     if H.has(sp.zoo, sp.nan, sp.oo) or complex_part(H) is not None or any(a > LARGEST for a in numbers):
         shown = ", ".join(f"{s} = {float(value):.9g}" for s, value in values.items() if value.is_number)
-        raise ValueError(f"`params` has {shown}, with which the expression is not a finite real one: change them.")
+        raise ValueError(f"`params` has {shown}, but then the expression is not a finite real one: change them.")
 
 
 def _check_samples(written: sp.Expr, values: Mapping[sp.Symbol, sp.Expr]) -> None:
@@ -601,8 +740,8 @@ def _check_samples(written: sp.Expr, values: Mapping[sp.Symbol, sp.Expr]) -> Non
         if isinstance(value, sampled) and all(term.free_symbols <= values.keys() for term in terms if term.has(symbol)):
             raise ValueError(
                 f"`params` has {symbol.name}, a spline, which is a function of the time: in a term without q and p it "
-                "moves nothing. Give a potential by functions, HamiltonianSystem(V, ndof=…, gradient=…); where it is "
-                "the time that is meant, pass time='t'."
+                "moves nothing. Give a potential by a function, HamiltonianSystem(lambda q: V(q[..., 0]), ndof=1); "
+                "where it is the time that is meant, pass time='t'."
             )
 
 
@@ -782,6 +921,20 @@ def generate(expressions: Sequence[sp.Expr], variables: Sequence[sp.Symbol], lib
     return summed
 
 
+def _hessian_by_program(
+    n: int, expressions: Sequence[sp.Expr], variables: Sequence[sp.Symbol], library: str
+) -> Callable[..., list[Any]]:
+    """∇²f by the first n variables, row by row: the program of f is differentiated sooner than its expression."""
+    (f,) = expressions
+    try:
+        program = recorded(f, variables)
+    except NotCompiled:
+        return generate(list(hessian(f, variables[:n])), variables, library)
+    x = program.inputs[:n]
+    rows = [slopes(s, x[: i + 1]) for i, s in enumerate(slopes(program.outputs[0], x))]
+    return Program(program.inputs, [rows[max(i, j)][min(i, j)] for i in range(n) for j in range(n)])
+
+
 def _by_products(f: sp.Expr) -> sp.Expr:
     """Integer powers beyond squares by a function that multiplies: NumPy raises to them by logarithms."""
 
@@ -844,11 +997,11 @@ def _modules(library: str, code: list[sp.Expr]) -> list[Any]:
     special = sorted(names - known - {"Max", "Min", "Abs", "Heaviside", "sign", "Piecewise", *BOUNDED})
     if library == "numpy":
         own = {"integer_power": _integer_power, "Heaviside": np.heaviside}
-        return [own | _special_functions(), "scipy", "numpy"] if special else [own, "numpy"]
+        return [own | _special_functions(), "scipy", np] if special else [own, np]  # by its name SymPy loads all of it
     if special:
         raise TypeError(
-            f"`expression` holds {', '.join(special)}, which torch has not: solve on NumPy states, with a method that "
-            "does not need tensors."
+            f"`expression` holds {', '.join(special)}, which torch does not have: solve on NumPy states, with a method "
+            "that does not need tensors."
         )
     import torch
 

@@ -7,25 +7,24 @@ import math
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
-from dataclasses import fields as dataclass_fields
+from dataclasses import dataclass, replace
 from functools import cached_property
-from types import MappingProxyType
+from types import FunctionType, MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, NoReturn, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.arguments import advice, check_flag, check_positive, checked_count, floats, real_number, told, warn
-from sympflow.arrays import Array, differentiable, is_tensor, one_lane, to_numpy
+from sympflow.arguments import advice, check_flag, check_positive, checked_count, floats, real_number, warn
+from sympflow.arrays import Array, learnable, one_lane, to_numpy
 from sympflow.hamiltonian.definition import bare_copy
 from sympflow.hamiltonian.domain import Domain, domain_of
 from sympflow.hamiltonian.fingerprint import fingerprint
 from sympflow.hamiltonian.friction import Friction
-from sympflow.hamiltonian.hamiltonian import UNNAMED, Hamiltonian
+from sympflow.hamiltonian.hamiltonian import Hamiltonian
 from sympflow.hamiltonian.linear_part import checked_damping, checked_inverse_mass, checked_stiffness, numeric
 from sympflow.hamiltonian.times import check_period, probe_times
-from sympflow.show.cards import Answering, Card, cut, numbers
+from sympflow.show.cards import Answering, Card, brief, numbers
 
 if TYPE_CHECKING:
     import sympy
@@ -33,7 +32,7 @@ if TYPE_CHECKING:
     from sympflow.hamiltonian.lattice_states import LatticeStates
     from sympflow.hamiltonian.linear_part import LinearPart
     from sympflow.hamiltonian.local import LocalHamiltonian
-    from sympflow.hamiltonian.symbolic import Kick
+    from sympflow.hamiltonian.symbolic import Kick, SymbolicHamiltonian
 
 MOST_DEGREES = 1_000_000
 TYPESET = 400  # characters of an H that notebooks typeset
@@ -44,7 +43,7 @@ SHOWN_NAMES = (
     *("from_sympy", "gradient", "hamiltonian", "hessian", "kinetic", "lattice", "linear_part", "name", "ndof", "pairs"),
     *("params", "period", "planets", "potential", "program", "schroedinger", "separable", "symbols", "t_span"),
     *("vector_field", "velocity"),
-    *("with_force", "with_params", "y0"),
+    *("with_force", "with_params", "with_scene", "y0"),
 )
 """The attributes that `dir` lists: those that users need. All others are for methods and studies."""
 MOST_WRITTEN_OUT = 400
@@ -66,6 +65,7 @@ MEANT = {
     "names": "the bodies have numbers, from 0, in the order of `masses`.",
 }
 """Remedies for arguments that other packages have."""
+SCENE = ("name", "domain", "y0", "t_span", "dt", "energy_scale", "exact")
 
 
 class SceneOptions(TypedDict, total=False):
@@ -84,7 +84,7 @@ class SceneOptions(TypedDict, total=False):
 class Scene:
     """The defaults with which a system is solved: see `HamiltonianSystem`."""
 
-    name: str = UNNAMED
+    name: str = ""
     domain: Domain | None = None
     y0: Any = None
     t_span: tuple[float, float] = (0.0, 100.0)
@@ -116,17 +116,16 @@ class Scene:
     def given(cls, options: Mapping[str, Any], **defaults: Any) -> Scene:
         """Return the scene of the options of a constructor, over its defaults."""
         options = {name: value for name, value in options.items() if name != "time" or value is not None}
-        known = [field.name for field in dataclass_fields(cls)]
         if "time" in options:
             raise TypeError(
                 "`time` is for systems that are written out, and those by one piece do not depend on it: leave it out, "
                 "or write H out by HamiltonianSystem.from_sympy(..., time='t')."
             )
         for name in options:
-            if name not in known:
-                remedy = MEANT.get(name) or advice(name, (*known, "params")) or "remove it."
+            if name not in SCENE:
+                remedy = MEANT.get(name) or advice(name, (*SCENE, "params")) or "remove it."
                 raise TypeError(
-                    f"`{name}` is not an argument of this system, nor of its scene, {', '.join(known)}: {remedy}"
+                    f"`{name}` is not an argument of this system, nor of its scene, {', '.join(SCENE)}: {remedy}"
                 )
         return cls(**{**defaults, **options})
 
@@ -137,10 +136,23 @@ class Scene:
         try:
             state = floats("y0", self.y0)
         except OverflowError:
-            raise ValueError("`y0` must be finite: it has an integer that no float is near.") from None
+            raise ValueError("`y0` must be finite: it has an integer too large for a float.") from None
         if state.shape != (2 * ndof,):
             raise ValueError(f"`y0` must have shape ({2 * ndof},), [q, p]; got {state.shape}.")
         return state
+
+
+class _OfScene:
+    """An attribute of a system that its scene holds."""
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self.name = name
+
+    def __get__(self, system: Any, owner: type | None = None) -> Any:
+        return self if system is None else getattr(system._scene, self.name)
+
+    def __set__(self, system: Any, value: Any) -> None:
+        raise AttributeError(self.name)  # see `HamiltonianSystem.__setattr__`
 
 
 class Parameters(dict[str, Any]):
@@ -193,8 +205,8 @@ class HamiltonianSystem(Hamiltonian, Answering):
         The period in t of H, of a driven system; other values than its own are a ValueError. Sections and multipliers
         take it.
     damping : float or array_like of shape (d,) or (d, d), optional
-        Γ: one rate, one for each p, or a symmetric positive semi-definite matrix; 0 is none. The splitting methods on
-        the splitting "kinetic" and the Runge–Kutta methods solve it; all else refuses it, with the reason.
+        Γ: one rate, one for each p, or a symmetric positive semi-definite matrix; 0 for none. Splitting
+        methods on the splitting "kinetic" and the Runge–Kutta methods solve it; all else refuses it, with the reason.
     name : str
     domain : Domain, optional
         Ω, where flows are trained. Classical methods never need one.
@@ -255,7 +267,7 @@ class HamiltonianSystem(Hamiltonian, Answering):
     _period: float | None = None
     _former_period: float | None = None
     _continuous = True  # False of systems that are made of others, whose H may jump where solutions do not feel it
-    exact: Callable[[Any], Array] | None = None
+    domain, t_span, energy_scale, exact = _OfScene(), _OfScene(), _OfScene(), _OfScene()
 
     def __init__(
         self,
@@ -293,7 +305,7 @@ class HamiltonianSystem(Hamiltonian, Answering):
             if value is not None and not definition.separable:
                 raise TypeError(f"`{argument}` only goes with `potential`: leave it out, it is part of `hamiltonian`.")
         M: Any = mass
-        followed = M if is_tensor(M) and (M.requires_grad or differentiable(M)) else None
+        followed = M if learnable(M) else None
         M = M if followed is None else to_numpy(M)
         inverse_mass, quadratic = checked_inverse_mass(M, d) if definition.separable else None, definition.separable
         K = None if stiffness_matrix is None else checked_stiffness(stiffness_matrix, d)
@@ -363,9 +375,20 @@ class HamiltonianSystem(Hamiltonian, Answering):
                 "times as long as by HamiltonianSystem.lattice, from one site and one bond, or by "
                 "HamiltonianSystem.pairs, from one pair. Use one of these."
             )
+        return cls._of_symbols(symbols, params, settled, damping, period)
+
+    @classmethod
+    def _of_symbols(
+        cls,
+        symbols: SymbolicHamiltonian,
+        params: Mapping[str, Any],
+        scene: Scene,
+        damping: float | ArrayLike | None,
+        period: float | None = None,
+    ) -> HamiltonianSystem:
         self = cls.__new__(cls)
         M = symbols.inverse_mass
-        self._make(symbols, None if M is None else numeric(M), M is not None, params, settled, damping, period)
+        self._make(symbols, None if M is None else numeric(M), M is not None, params, scene, damping, period)
         return self
 
     @classmethod
@@ -596,13 +619,13 @@ class HamiltonianSystem(Hamiltonian, Answering):
         """
         if self.local is None:
             raise TypeError(
-                f"`system` {self.called} is not a lattice, and only lattices have subsystems of a few sites: define it "
+                f"`system` {self.name!r} is not a lattice, and only lattices have subsystems of a few sites: define it "
                 "by HamiltonianSystem.lattice."
             )
         local = self.local.subsystem(sites, boundary)
         if self.damping is not None and self.damping.ndim:
             raise ValueError(
-                f"`damping` of {self.called} differs from site to site, and a subsystem needs sites that are alike: "
+                f"`damping` of {self.name!r} differs from site to site, and a subsystem needs sites that are alike: "
                 "give one rate."
             )
         domain = None
@@ -750,9 +773,9 @@ class HamiltonianSystem(Hamiltonian, Answering):
 
     def _set_scene(self, params: Mapping[str, Any], scene: Scene) -> None:
         self._params = Parameters(params)
-        self.exact, self.t_span, self._dt, self.energy_scale = scene.exact, scene.t_span, scene.dt, scene.energy_scale
-        self.y0 = scene.state(self.ndof)
-        self.domain = None if scene.domain is None else domain_of(scene.domain, self)
+        self._dt, self._y0 = scene.dt, scene.state(self.ndof)
+        domain = None if scene.domain is None else domain_of(scene.domain, self)
+        self._scene = replace(scene, domain=domain)
         if self.domain is not None and self.domain.sample(1).shape != (1, 2 * self.ndof):
             raise ValueError(f"`domain` must be a set of states [q, p] of length {2 * self.ndof}.")
         self.definition.place(self.y0, self.domain, self.inverse_mass, self.t_span)
@@ -761,40 +784,62 @@ class HamiltonianSystem(Hamiltonian, Answering):
     def scene(self) -> Scene:
         """The scene for other parameters: an `exact` solution belongs to those of the system, and is left out."""
         dt = None if self.step_is_open else self.dt
-        return Scene(self.name, self.domain, self.y0, self.t_span, dt, self.energy_scale)
+        return Scene(self._name, self.domain, self.y0, self.t_span, dt, self.energy_scale)
+
+    def with_scene(self, **scene: Unpack[SceneOptions]) -> HamiltonianSystem:
+        """The same system with other defaults: of `name`, `domain`, `y0`, `t_span`, `dt`, `energy_scale` and `exact`.
+
+        A step that was not given is chosen anew, and `exact` goes with its `y0` and its `t_span`.
+
+        Examples
+        --------
+        >>> system = HamiltonianSystem.from_sympy("p**2/2 + q**2/2", y0=[1, 0])
+        >>> system.with_scene(y0=[0, 2], t_span=(0, 10)).y0
+        array([0., 2.])
+        """
+        other = bare_copy(self)
+        known = {**vars(self._scene), "y0": self._y0, "dt": self._dt}
+        known["exact"] = None if {"y0", "t_span"} & {*scene} else self.exact
+        settled = Scene.given({**known, **scene})
+        other._name = settled.name
+        other._set_scene(self._params, settled)
+        return other
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if not isinstance(getattr(type(self), name, None), property | cached_property | FunctionType | _OfScene):
+            super().__setattr__(name, value)
+            return
+        remedy = "make a system with it."
+        if name in SCENE:
+            of_run = "pass it to solve(), or " if name in ("y0", "t_span", "dt") else ""
+            remedy = f"{of_run}take system.with_scene({name}=…)."
+        if name == "params":
+            remedy = "take system.with_params(name=…), or pass it to solve()."
+        raise AttributeError(f"`{name}` of a system cannot be set: {remedy}", name=name, obj=self)
+
+    @property
+    def y0(self) -> Any:  # with the scene's, once it is checked
+        return self._y0
 
     @property
     def dt(self) -> float:
         """The default step of the fixed-step classical methods: the one given, or by the fastest motion."""
-        if self._dt is None:
-            from sympflow.hamiltonian.scales import STEP, default_step
+        return self._chosen_step if self._dt is None else self._dt
 
-            if self.step_is_open:  # a run chooses it at its own states
-                return STEP
-            self._dt = default_step(self)
-        return self._dt
+    @cached_property
+    def _chosen_step(self) -> float:
+        from sympflow.hamiltonian.scales import STEP, default_step
 
-    @dt.setter
-    def dt(self, dt: float) -> None:
-        self._dt = dt
+        return STEP if self.step_is_open else default_step(self)  # a run chooses it at its own states
 
     @property
     def step_is_open(self) -> bool:
         """True if `dt` was not given, and the system has no states from which it could be chosen."""
-        return self._dt is None and self.y0 is None and self.domain is None
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Take the state of a pickle, of earlier versions too: they kept `params` as such, and tested no functions."""
-        earlier = {"functions_given": False, "_tested": {}, "_params": Parameters(state.get("params", {}))}
-        earlier |= {"_dt": state.get("dt"), "_inverse_mass": state.get("inverse_mass")}
-        earlier["local"] = state["definition"] if state["definition"].loops else None
-        now = {name: value for name, value in state.items() if name not in ("params", "dt", "inverse_mass")}
-        for name, value in {**earlier, **now}.items():
-            setattr(self, name, value)
+        return self._dt is None and self._y0 is None and self.domain is None
 
     @property
     def params(self) -> Mapping[str, float]:
-        """The values of the parameters, read-only: they are part of H, from which all code is generated.
+        """The values of the parameters, read-only, because code is generated from them.
 
         A system with others is made by `HamiltonianSystem.from_sympy`, or by the function of its scene.
         """
@@ -810,12 +855,12 @@ class HamiltonianSystem(Hamiltonian, Answering):
             return
         if self.symbols is None:
             raise TypeError(
-                f"`params` are of symbolic systems, and {self.called} is given by functions, which hold their values: "
+                f"`params` are for symbolic systems, and {self.name!r} is given by functions, which hold their values: "
                 "make a system for each, or define it with HamiltonianSystem.from_sympy(..., params=...)."
             )
         if self.external_force is not None:
             raise ValueError(
-                f"`params` of {self.called} are those of H and not of its external force: make a system for each value."
+                f"`params` of {self.name!r} are those of H and not of its external force: make a system for each value."
             )
         known = [s.name for s in self.symbols.written[1]]
         for name in names:
@@ -823,9 +868,8 @@ class HamiltonianSystem(Hamiltonian, Answering):
                 has = f"which has {', '.join(known)}" if known else "which has none: write H with symbols for them"
                 if name == "damping" and self.damping is not None:
                     has += "; `damping` is not one: make a system for each value"
-                raise ValueError(f"`params` has {name!r}, no parameter of {self.called}, {has}.")
+                raise ValueError(f"`params` has {name!r}, which is not a parameter of {self.name!r}, {has}.")
 
-    @told
     def with_params(self, **values: float) -> HamiltonianSystem:
         """The same system with other values of some parameters. Most methods reuse the compiled code.
 
@@ -850,9 +894,15 @@ class HamiltonianSystem(Hamiltonian, Answering):
         """
         if self.local is not None:
             return HamiltonianSystem._of_local(self.local.with_params(values), self.damping, self.scene)
+        from sympflow.hamiltonian.symbolic import checked_params
+
         self.check_parameters(values)
         H, time = self.symbols.written[0], self.symbols.named_time
         params = {**self.params, **values}
+        checked = checked_params(params)
+        symbols = self.symbols.revalued(checked)
+        if symbols is not None:
+            return HamiltonianSystem._of_symbols(symbols, checked, self.scene, self.damping)
         made = HamiltonianSystem.from_sympy(H, params=params, time=time, damping=self.damping, **vars(self.scene))
         # Values of the drive may have changed the period: it is tested where it is asked for.
         made._former_period = self.period or self._former_period
@@ -948,7 +998,7 @@ class HamiltonianSystem(Hamiltonian, Answering):
 
     @cached_property
     def fingerprint(self) -> tuple[float, ...]:
-        """H at 8 fixed states less H at a ninth, then Γ: what tells a trained flow whether this is its system."""
+        """H at 8 fixed states less H at a ninth, then Γ: a trained flow recognises its system by them."""
         return fingerprint(self)
 
     def __repr__(self) -> str:
@@ -961,16 +1011,14 @@ class HamiltonianSystem(Hamiltonian, Answering):
         if self.definition.given_functions:
             kind += f", arrays: it could not be traced, for {self.untraced}" if self.form is None else ", traced"
         degrees = f"{self.ndof:,} degree{'s' * (self.ndof > 1)} of freedom"
-        named = self.title if self.name == UNNAMED and self.symbols is not None else f"{self.name}({params})"
+        named = f"{self.name}({params})" if self._name else self.title
         return f"<HamiltonianSystem {named}: {degrees}, {kind}>"
 
     @property
     def title(self) -> str:
         """The name and the parameters as they are printed; H where the name says nothing."""
         params = parameters_text(self.params, GREEK, " = ")
-        name = PROPER.get(self.name, self.name.replace("_", " "))
-        if self.name == UNNAMED and self.symbols is not None:
-            name = cut(f"H = {self.symbols.written[0]}", 60)
+        name = PROPER.get(self.name, self.name.replace("_", " ") if self._name else self.name)
         return name + (f", {params}" if params else "")
 
     def card(self) -> Card:
@@ -980,14 +1028,14 @@ class HamiltonianSystem(Hamiltonian, Answering):
 
             formula = "H = " + sympy.latex(self.symbols.H)
         facts = {
-            "H": "" if formula else H,
+            "H": H,
             "parameters": parameters_text(self.params, GREEK, " = "),
             "degrees of freedom": f"{self.ndof:,}",
             "structure": repr(self).rsplit("freedom, ", 1)[-1].rstrip(">"),
             "y0": "" if self.y0 is None else numbers(self.y0),
             "t_span": f"{self.t_span[0]:g} … {self.t_span[1]:g}",
             "dt": "" if self._dt is None else f"{self._dt:g}",
-            "domain": "" if self.domain is None else repr(self.domain),
+            "domain": "" if self.domain is None else brief(repr(self.domain)),
         }
         return Card(self.title, facts, formula=formula)
 
@@ -1027,7 +1075,7 @@ COUNTED = {
 
 
 class counting_view:
-    """A view of a system that tells `count` of each evaluation of a force or a derivative of it, not of inner ones."""
+    """A view of a system that calls `count` for each evaluation of a force or a derivative of it, except inner ones."""
 
     def __init__(self, system: HamiltonianSystem, count: Callable[[str, Array], None]) -> None:
         self._system, self._count = system, count

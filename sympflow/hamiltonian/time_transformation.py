@@ -83,25 +83,24 @@ def time_transformed(
         )
     c = default_shift(system) if shift is None else checked_shift(shift)
     symbols = system.written if system.local is None else system.local.spelled  # with all terms one by one
+    name = system.scene.name and f"log_{system.name}"
     if symbols is not None:
         import sympy as sp
 
         from sympflow.hamiltonian.symbolic import exact
 
         H = sp.log(symbols.T + sp.Symbol(f"p{symbols.ndof + 1}", real=True)) - sp.log(exact(c) - symbols.V)
-        transformed = HamiltonianSystem.from_sympy(H, name=f"log_{system.name}", energy_scale=1.0)
+        transformed = HamiltonianSystem.from_sympy(H, name=name, energy_scale=1.0)
         transformed._params = Parameters({**system.params, "shift": c})
     else:
         transformed = HamiltonianSystem.__new__(HamiltonianSystem)
-        scene = Scene(f"log_{system.name}", dt=0.05, energy_scale=1.0)
+        scene = Scene(name, dt=0.05, energy_scale=1.0)
         transformed._make(_Logarithmic(system, c), None, False, {**system.params, "shift": c}, scene)
-    transformed.domain = domain
-    if system.y0 is not None:
-        transformed.y0 = Scene(y0=lifted(system, system.y0, c)).state(transformed.ndof)
-        scale = time_scale(system, c)
-        transformed.dt = system.dt * scale
-        transformed.t_span = (0.0, (system.t_span[1] - system.t_span[0]) * scale)
-    return transformed
+    if system.y0 is None:
+        return transformed.with_scene(domain=domain)
+    scale = time_scale(system, c)
+    span = (0.0, (system.t_span[1] - system.t_span[0]) * scale)
+    return transformed.with_scene(domain=domain, y0=lifted(system, system.y0, c), dt=system.dt * scale, t_span=span)
 
 
 def default_shift(system: HamiltonianSystem) -> float:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
-from sympflow.arrays import Array, beside, is_tensor, of_library, to_numpy
+from sympflow.arrays import Array, as_array, beside, of_library, to_numpy
 
 
 def stage_time(t: Any, c: float, h: Any) -> Any:
@@ -19,19 +20,15 @@ def checked_time(t: Any, x: Array, batch: tuple[int, ...]) -> Any:
     """Return a time as a float, or as doubles of the library of x with the shape of the batch; checked."""
     if isinstance(t, float):
         return t
-    tensor = is_tensor(t)
-    try:
-        given: Any = t if tensor else np.asarray(t)
-        if given.is_complex() if tensor else given.dtype.kind not in "iuf":
-            raise TypeError
-    except (TypeError, ValueError):
-        raise TypeError(f"`t` must be a real number, or an array of them; got {t!r}.") from None
+    given = as_array(t)
+    if not re.match(r"(torch\.)?(u?int|b?float)", str(given.dtype)):
+        raise TypeError(f"`t` must be a real number, or an array of them; got {t!r}.")
     if given.ndim and tuple(given.shape) != tuple(batch):
         raise ValueError(
             f"`t` must be a number, or have the shape {tuple(batch)} of the batch, one time a state; got "
             f"{tuple(given.shape)}."
         )
-    return beside(of_library(given, x), x) if tensor or given.ndim else float(given)
+    return beside(of_library(given, x), x)
 
 
 PROBED = np.array([0.0, 0.1327, 0.3819, 0.7211])

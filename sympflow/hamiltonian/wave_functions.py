@@ -54,7 +54,7 @@ class WaveFunctionHamiltonian(LocalHamiltonian):
     def _set_rates(self) -> None:
         self.transform = Transform(self.grid, ("periodic",) * len(self.grid))
         values = {s: v for s, v in zip(self.c, self.params.values(), strict=True) if not isinstance(v, np.ndarray)}
-        w = sp.lambdify(self.k, self.w.xreplace(values), "numpy")
+        w = sp.lambdify(self.k, self.w.xreplace(values), np)
         waves = []
         for axis, (n, length) in enumerate(zip(self.grid, self.length, strict=True)):
             k = self.transform.angles(axis) * (n / length)

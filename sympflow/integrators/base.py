@@ -69,9 +69,12 @@ class FixedStep(Integrator):
         """Return a warning of the method with its step on a system, or nothing."""
         return ""
 
-    def multiplier(self, z: np.ndarray) -> np.ndarray:
-        """Return what stands for exp(iz), (n,), in a step of z radians of an oscillation; that where any z is borne."""
-        return np.exp(1j * z)
+    def oscillation_error(self, z: np.ndarray) -> np.ndarray:
+        """Return by how much an oscillation of z radians in a step is wrong, (n,); 0 where any z is borne.
+
+        It is the larger of the error of phase and size for each radian, and of the swing of the energy in a period.
+        """
+        return 0.0 * z
 
     def stepper(self, problem: Problem) -> Stepper:
         """Return the stepper of one run, for states such as the problem's y0."""
@@ -99,7 +102,7 @@ class FixedStep(Integrator):
         return {"force_evaluations": 0, "hessian_evaluations": 0}
 
     def checked_step(self, system: HamiltonianSystem, t: Any, y: Array, h: Any) -> Array:
-        """`step`, whose failure on tensors is told from one on arrays."""
+        """`step`, with a message of its own where it fails on tensors."""
         try:
             return self.step(system, t, y, h)
         except (TypeError, RuntimeError, AttributeError) as error:

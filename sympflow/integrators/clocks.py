@@ -115,7 +115,7 @@ class LogarithmicClock(NamedTuple):
         return PhysicalRun(self, problem).outcome()
 
     def steps(self, t_span: tuple[float, float], y0: Array) -> Steps:
-        """The steps of the run, their physical lengths; in a batch one that has ended waits with length 0."""
+        """The steps of the run, their physical lengths; in a batch, trajectories that have ended get length 0."""
         run = PhysicalRun(self, Problem(self.system, *t_span, y0))
         run.stride = 1
         sign, batch = run.sign, y0.shape[:-1]

@@ -79,7 +79,7 @@ class Composition(ABC, ArraySteps):
         self.method, self.scheme = method, scheme
 
     def check_system(self, dt: float) -> None:
-        """Raise a ValueError where the friction or the drive of the system asks for shorter steps, or has no flow."""
+        """Raise a ValueError where the friction or the drive of the system needs shorter steps, or has no flow."""
 
     def longest_step(self) -> float:
         """The longest step with which the method is to be used."""
@@ -150,31 +150,26 @@ class KineticPotential(Composition):
         self.method, self.scheme, self.system = method, scheme, system
         if not system.separable:
             raise ValueError(
-                f"`method` {method!r} needs a separable system, H = T(p) + V(q), and {system.called} is not: use "
+                f"`method` {method!r} needs a separable system, H = T(p) + V(q), and {system.name!r} is not: use "
                 f"{system.definition.instead}."
             )
         if (scheme.nystrom or scheme.level) and not system.quadratic_kinetic:
             raise ValueError(
-                f"`method` {method!r} needs a kinetic energy ½ pᵀM⁻¹p, which {system.called} has not: use a scheme "
-                "for any separable system, such as 'kahan_li8'."
+                f"`method` {method!r} needs a kinetic energy ½ pᵀM⁻¹p, which {system.name!r} does not have: use a "
+                "scheme for any separable system, such as 'kahan_li8'."
             )
-        if system.friction and not system.quadratic_kinetic:
-            raise ValueError(
-                f"`method` {method!r} solves friction exactly where the kinetic energy is ½ pᵀM⁻¹p, which "
-                f"{system.called} has not: use a Runge–Kutta method such as 'dop853'."
-            )
+        system.check_damped_drifts()
 
     def check_system(self, dt: float) -> None:
-        if self.system.friction:
-            damping = self.system.friction.largest
-            back = -sum(s.one for s in self.scheme.substeps if s.kind == "drift" and s.one < 0)
-            if damping * back * dt > MOST_GROWTH:
-                raise ValueError(
-                    f"`dt` {dt:.6g} is too long for method {self.method!r} with a damping of {damping:.6g}: its "
-                    f"drifts of {back:.3g} of a step go back in time, where friction lets momenta grow by a factor "
-                    f"exp({damping * back * dt:.3g}). Use a `dt` of at most {MOST_GROWTH / (damping * back):.3g}, or "
-                    "a scheme without such drifts, as 'verlet' or 'chin4c'."
-                )
+        damping = self.system.friction.largest
+        back = -sum(s.one for s in self.scheme.substeps if s.kind == "drift" and s.one < 0)
+        if damping * back * dt > MOST_GROWTH:
+            raise ValueError(
+                f"`dt` {dt:.6g} is too long for method {self.method!r} with a damping of {damping:.6g}: its drifts of "
+                f"{back:.3g} of a step go back in time, where friction lets momenta grow by a factor "
+                f"exp({damping * back * dt:.3g}). Use a `dt` of at most {MOST_GROWTH / (damping * back):.3g}, or a "
+                "scheme without such drifts, as 'verlet' or 'chin4c'."
+            )
         if self.system.kinetic_timed:
             self.system.drift(np.zeros(self.system.ndof), 0.0, 0.0)
 
@@ -239,14 +234,12 @@ class KineticPotential(Composition):
         for substep, at in zip(self.scheme.substeps, times, strict=True):
             c = substep.one
             if substep.kind == "drift":
-                if system.friction:
+                if system.kinetic_timed:
+                    U = U + system.drift_jacobian(p, at, c * h[..., 0]) @ P
+                else:
                     mean, end = system.friction.drift(P.swapaxes(-1, -2), c * h[..., None])
                     U = U + _velocities(system, p, mean.swapaxes(-1, -2))
                     P = end.swapaxes(-1, -2)
-                elif system.kinetic_timed:
-                    U = U + system.drift_jacobian(p, at, c * h[..., 0]) @ P
-                else:
-                    U = U + c * h[..., None] * _velocities(system, p, P)
                 q, p = system.drifted(q, p, at, c * h)
             else:
                 if system.local is None:
@@ -404,7 +397,7 @@ class LinearRest(ExactMaps):
         if scheme.nystrom and any(part.turns for part in self.parts.rest):
             raise ValueError(
                 f"`method` {method!r} has a Nyström scheme, which needs a rest of H that is a potential U(q), and that "
-                f"of {system.called} depends on p too: use 'linear_kahan_li6', 'linear_aba864' or 'impulse'."
+                f"of {system.name!r} depends on p too: use 'linear_kahan_li6', 'linear_aba864' or 'impulse'."
             )
         if scheme.level > FORCE_GRADIENT:
             raise ValueError(
@@ -576,7 +569,7 @@ class KeplerInteraction(Composition):
         frame = frame_of(system)
         if frame is None:
             raise ValueError(
-                f"`method` {method!r} is for planets about a star, which {system.called} is not: make it by "
+                f"`method` {method!r} is for planets about a star, which {system.name!r} is not: make it by "
                 "HamiltonianSystem.planets, or take the splitting 'kinetic', such as 'srkn11b'."
             )
         frame.check(method)

@@ -17,7 +17,7 @@ Its duties:
 9. `arrays_only` says so, where `step` and `run` take NumPy arrays only.
 10. `takes_friction` is False, and a damped system is refused before the integrator sees it; or the method takes the
    friction −Γp into account, as one that steps by `system.vector_field` does. `takes_forces` says the same of a force
-   that is none of H, which only `vector_field` holds.
+   that does not come from H and that only `vector_field` has.
 11. `takes_driving` is False, and a driven system, H(t, q, p), is refused before the integrator sees it; or the method
    takes H and its derivatives at the times of its stages, t + c·h, as `system.vector_field(y, t + c * h)` does. Where
    c is 0 or 1, `forces_at_ends(system)` says so, and a run is cut at the jumps of H; where c lies outside of these,
@@ -118,7 +118,7 @@ class Interrupted(KeyboardInterrupt):
 
 @dataclass(frozen=True)
 class Problem:
-    """A validated initial value problem, and the outputs that `solve` asks an integrator for."""
+    """A validated initial value problem, and the outputs that `solve` wants of an integrator."""
 
     system: HamiltonianSystem
     t0: float
@@ -198,7 +198,7 @@ class Integrator:
 
     @property
     def label(self) -> str:
-        """The name in rows and legends, which tells apart what the options make another method."""
+        """The name in rows and legends, which distinguishes methods that differ in options."""
         return self.name
 
     @property
@@ -223,8 +223,9 @@ class Integrator:
     def check_followed(self, problem: Problem) -> None:
         """Raise a ValueError where gradients do not flow to parameters."""
         raise ValueError(
-            f"`params` has {', '.join(problem.followed)}, to which no gradient flows through method {self.name!r}: use "
-            "a splitting method on the splitting 'kinetic', such as 'kahan_li8', a Gauss method, or detach them."
+            f"`params` has {', '.join(problem.followed)}, but no gradient flows to parameters through method "
+            f"{self.name!r}: use a splitting method on the splitting 'kinetic', such as 'kahan_li8', a Gauss method, "
+            "or detach them."
         )
 
     def forces_at_ends(self, system: HamiltonianSystem) -> bool:
@@ -271,7 +272,7 @@ class Integrator:
         return self.flow_for(system)
 
     def on_extended(self, system: HamiltonianSystem, extended: HamiltonianSystem) -> Integrator | None:
-        """Return the same method on a driven system with the time and its momentum E; None where it is none there."""
+        """Return the same method on a driven system with the time and its momentum E; None where there is none."""
         return None if self.trained else self
 
     def identity_for(self, system: HamiltonianSystem) -> Identity | None:

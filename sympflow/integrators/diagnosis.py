@@ -15,11 +15,11 @@ from weakref import WeakSet
 import numpy as np
 
 from sympflow.arguments import warn
-from sympflow.arrays import Array, is_tensor, masked, readable, to_numpy
+from sympflow.arrays import Array, masked, readable, to_numpy
 from sympflow.hamiltonian.scales import known_scale, rate_of_motion
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep
-from sympflow.integrators.contract import Integrator, Outcome, Problem
+from sympflow.integrators.contract import Failure, Integrator, Outcome, Problem
 from sympflow.integrators.domain_exit import check_domain, check_system_along, warn_of_loss
 
 if TYPE_CHECKING:
@@ -42,16 +42,22 @@ ACROSS, AROUND, PARTS = 0.25, 8, 9
 """A step leaps if, at one of so many points on it, what vanishes is so small a part of what it is at another; around it
 H changes by more than a tenth of the kinetic energy within so many steps."""
 LOST_AROUND = 0.1
-TOO_LONG = 0.05  # energy error, over the size of the energy, of a run whose step is too long
-PHASES, PHASE_ERROR = np.geomspace(1e-3, 3.0, 400), 0.01
-"""Where energy is not kept, a step is too long if an oscillation is off by so much of a radian, or beyond the last."""
+TOO_LONG = 0.01
+"""The energy error, over the size of the energy, from which a step is too long: that of Verlet's method at a tenth of
+its stability. Where energy is not kept, the error of an oscillation as fast as the motion."""
+TOO_LOOSE = 0.05  # the same, of adaptive methods, and of the end of a run on a clock
+PHASES = np.geomspace(1e-3, 3.0, 400)  # oscillations, in radians a step; beyond the last one none is followed
 LARGE = 200  # degrees of freedom
 FEW_STEPS = 20
+FINER, MOST_FINER = 4, 64  # steps for one of a run, by which it is judged; most of them between two outputs
 MOST_AGAIN = 100  # steps on a clock, which are made again in halves
 SAFE = 4  # steps of so many `dt` of a system are not looked at in a run of few
 FEWEST_NEAR, LOST_DIGITS = 100, 1e-9
 """The closest of so many steps, or of all, to a value where terms cancel is that part of the way from it; a force with
 that share of errors there is told."""
+STRAIGHT = 1 - 1e-9  # of the squared cosine of velocity and acceleration, of a motion that may lead to a centre
+NUDGE = 1e-9  # of the momenta, by which forces change them to show the way of what is at rest
+TURNING = Failure.CLOCK, Failure.ENCOUNTER  # breakdowns of methods that turn at an exact collision
 NO_FORCE = (
     "At the last state the force is NaN: write H without parts that overflow, such as exp(800), or are 0/0; shorter "
     "steps do not help. Start elsewhere"
@@ -91,6 +97,8 @@ def diagnose(
     told = not interrupted and diagnose_piece(outcome, integrator, problem, rows)
     values, between = readable(outcome.y), system.between_impulses
     held = values and problem.store is None and not _failed(outcome)
+    if held and not told and problem.parameter_values is None:
+        told = warn_of_collision(outcome, integrator, problem)
     if held and system.definition.leaps and problem.parameter_values is None:
         told = warn_of_leap(outcome, system, y0) or told
     if values and system.functions_given:
@@ -174,11 +182,44 @@ def note_poles(
         passage, which = found[likely[0]], _which(problem, likely, values)
         warn(
             f"H{which} changed for good between t = {passage.begin:.10g} and {passage.end:.10g}, where a step leapt "
-            f"over a place at which it is infinite, {passage.place}: the run means nothing after that. "
+            f"over a place at which it is infinite, {passage.place}: the run is meaningless after that. "
             f"{_remedy(integrator, problem)}.",
             RuntimeWarning,
         )
     return [*found.values()]
+
+
+def warn_of_collision(outcome: Outcome, integrator: Integrator, problem: Problem) -> bool:
+    """Warn, and return True, of a run that turns at an exact collision, as those on a clock do, or Kepler's motion."""
+    system, poles = problem.system, problem.system.definition.poles
+    if not isinstance(integrator, FixedStep) or integrator.breakdown not in TURNING or not len(outcome.t):
+        return False
+    if poles is None or not poles.watched:
+        return False
+    d, y0 = system.ndof, to_numpy(problem.y0).reshape(-1, 2 * system.ndof)[:MOST_NAMED].astype(float)
+    with np.errstate(all="ignore"):
+        force, p = -np.asarray(system.gradient(y0))[:, :d], y0[:, d:]
+        sizes, strengths = np.abs(p).max(1, keepdims=True), np.abs(force).max(1, keepdims=True)
+        share = np.where(sizes > 0, NUDGE * sizes, 1.0) / np.maximum(strengths, 1e-300)
+        falling = np.concatenate([y0[:, :d], p + share * force], axis=1)  # of what is at rest, as it begins to move
+        if system.symbols is None and system.local is None:  # whose places are written in symbols for that
+            v, a = (np.asarray(system.gradient(np.concatenate([y0[:, :d], x], axis=1)))[:, d:] for x in (p, force))
+            if ((v * a).sum(1) ** 2 < STRAIGHT * (v * v).sum(1) * (a * a).sum(1)).all():
+                return False
+        exact = poles.exact
+        if not exact or not len(rows := np.flatnonzero(exact.ahead(falling))):
+            return False
+        begin, end = (np.full(len(rows), float(t)) for t in (problem.t0, outcome.t[-1]))
+        times, *_ = _end_of_solution(system, begin, y0[rows], end)
+    met = np.flatnonzero(np.isfinite(times))
+    if len(met):
+        warn(
+            f"The solution{_which(problem, rows[met].tolist(), None)} becomes infinite, at about t = "
+            f"{times[met[0]]:.10g}, by a collision: no step leads beyond that, and the run turns there. End `t_span` "
+            "before, or soften H.",
+            RuntimeWarning,
+        )
+    return bool(len(met))
 
 
 def warn_of_cancelling(outcome: Outcome, problem: Problem) -> None:
@@ -233,7 +274,7 @@ def _steps_of(
     width, length = 2 * problem.system.ndof, integrator.step_length(problem.system)
     y0 = to_numpy(problem.y0).reshape(-1, width)[row]
     known = problem.t_eval is None and problem.save_every == 1 and (length is not None or problem.y0.ndim == 1)
-    for end in () if known or is_tensor(problem.y0) else ends:
+    for end in () if known else ends:
         n_steps = abs(end - problem.t0) / length if length else outcome.stats.get("n_steps", 0)
         if n_steps * width <= MOST_WALKED:
             try:
@@ -321,7 +362,7 @@ def _end(
 
 
 def warn_of_long_steps(outcome: Outcome, integrator: Integrator, problem: Problem) -> None:
-    """Warn of what a method doubts, and of steps with which the energy is off by `TOO_LONG` of its size.
+    """Warn of what a method doubts, and of steps with which the energy is off by more than 1 % of its size.
 
     Where energy is not kept, the motion at the start and the end must not be too fast for the step. On a clock the
     energy may be kept although the time is wrong: a run of few steps is compared with one in halves.
@@ -341,7 +382,7 @@ def warn_of_long_steps(outcome: Outcome, integrator: Integrator, problem: Proble
         return
     seen = LOOKED_AT * (not few) if system.ndof <= LARGE else min(LOOKED_AT, n_steps // 200)
     fixed = integrator if isinstance(integrator, FixedStep) and not known else None
-    if not system.keeps_energy:
+    if not system.keeps_energy and dt is not None:
         if (
             fixed
             and n
@@ -353,15 +394,19 @@ def warn_of_long_steps(outcome: Outcome, integrator: Integrator, problem: Proble
         return
     if not n or not seen or system.between_impulses is not system:
         return
-    off = _energy_off(outcome, problem, seen, dt is None)
+    most = TOO_LOOSE if dt is None else TOO_LONG
+    if system.keeps_energy:
+        off = _energy_off(outcome, problem, seen, most, dt is None)
+    else:
+        off = _energy_lost(outcome, problem)
     told = "the energy of the run " + ("overflows" if off == math.inf else f"is off by {100 * off:.2g} %")
-    if off <= TOO_LONG and fixed and fixed.in_another_time and n_steps <= MOST_AGAIN:
-        off = _end_off(outcome, fixed, problem)
+    if off <= most and fixed and fixed.in_another_time and n_steps <= MOST_AGAIN:
+        off, most = _end_off(outcome, fixed, problem), TOO_LOOSE
         told = f"with half of it the run ends {100 * off:.2g} % of its size away"
-    if off > TOO_LONG:
+    if off > most:
         what, remedy = "`rtol` is too large", "Take rtol=1e-8, or a method of fixed steps with tol=1e-6"
         if dt is not None:
-            what, remedy = f"`dt` {dt:g} is too long", "Take a shorter step, or tol=1e-6, for which it is chosen"
+            what, remedy = f"`dt` {dt:g} is too long", "Take a shorter step, or tol=1e-6, which chooses one"
         warn(f"{what} for method {integrator.label!r}: {told}. {remedy}.", RuntimeWarning)
 
 
@@ -383,7 +428,7 @@ def try_steps(integrator: Integrator, system: HamiltonianSystem, t_span: tuple[f
             warn_of_long_steps(outcome, integrator, piece)
 
 
-def _energy_off(outcome: Outcome, problem: Problem, seen: int, each: bool) -> float:
+def _energy_off(outcome: Outcome, problem: Problem, seen: int, most: float, each: bool) -> float:
     """The largest change of H at the start and some outputs, over its size, at `each` or at most; 0 if not known."""
     system, n, width = problem.system, len(outcome.t), 2 * problem.system.ndof
     every = slice((n - 1) % (step := -(-n // seen)), None, step)  # the last among them
@@ -403,20 +448,53 @@ def _energy_off(outcome: Outcome, problem: Problem, seen: int, each: bool) -> fl
     with np.errstate(all="ignore"):
         try:
             H = np.asarray(functions.hamiltonian(y, **numbers))
-            if (H.max(0) - H.min(0) <= TOO_LONG * np.abs(H[0])).all():
+            if (H.max(0) - H.min(0) <= most * np.abs(H[0])).all():
                 return 0.0
             change = np.abs(H - H[0])
-            if not (change > TOO_LONG * np.abs(H[0])).any():
+            if not (change > most * np.abs(H[0])).any():
                 return 0.0
             sizes = 0.5 * np.abs(y * np.asarray(functions.gradient(y, **numbers))).sum(-1)
             size = sizes if each else sizes.max(0)
         except (ArithmeticError, ValueError, TypeError):  # a function that takes no batches
             return 0.0
         off = np.fmax.reduce(change / np.maximum(size, system.energy_scale or 0.0), axis=None)  # of a rest 0/0
-        if off > TOO_LONG:  # told as the energy error of the run
+        if off > most:  # told as the energy error of the run
             off = np.fmax(off, np.fmax.reduce(change / known_scale(system, H, sizes), axis=None))
     if np.isfinite(H[0]).all() and np.isinf(change).any():
         return math.inf
+    return float(off) if off < math.inf else 0.0
+
+
+def _energy_lost(outcome: Outcome, problem: Problem) -> float:
+    """The energy that the steps of a driven or damped run lose in all, over its size; 0 if not known.
+
+    It is that of the states at a few outputs and of fine steps from the ones before, times the number of outputs, or
+    of those within the time in which friction forgets.
+    """
+    system, n, width = problem.system, len(outcome.t), 2 * problem.system.ndof
+    y0, t = to_numpy(problem.y0), np.append(problem.t0, outcome.t)
+    y = np.concatenate([y0[None], to_numpy(outcome.y)]).reshape(n + 1, -1, width)[:, :LOOKED_AT].astype(float)
+    t, y = (x[int(t[1] == t[0]) :] for x in (t, y))
+    trajectories = 1 if y0.ndim == 1 else max(1, y0.size // width)
+    parts = FINER * math.ceil(outcome.stats.get("n_steps", 0) / trajectories / max(len(t) - 1, 1))
+    if len(t) < 2 or parts > MOST_FINER or system.ndof > LARGE:
+        return 0.0
+    k = np.unique(np.linspace(0, len(t) - 2, LOOKED_AT // 2).astype(int))
+    h = (t[k + 1] - t[k])[:, None] / parts
+    with np.errstate(all="ignore"):
+        try:
+            fine = y[k]
+            for i in range(parts):
+                fine = fine + h[..., None] * _increment(system, t[k][:, None] + i * h, fine, h)[0]
+            ends = np.broadcast_to(t[k + 1][:, None], fine.shape[:-1])
+            lost = np.mean(system.hamiltonian(y[k + 1], ends) - system.hamiltonian(fine, ends), axis=0)
+            slopes = np.asarray(system.gradient(y[k], np.broadcast_to(t[k][:, None], ends.shape)))
+            size = 0.5 * np.abs(y[k] * slopes)[..., system.ndof :].sum(-1).max(0)  # T: that of a rotor does not grow
+        except (ArithmeticError, ValueError, TypeError):  # a function that takes no batches
+            return 0.0
+        rates = system.friction.rates[system.friction.rates > 0] if system.friction else np.zeros(0)
+        memory = 1 / (rates.min() * np.abs(t[-1] - t[0])) if rates.size else 1.0
+        off = np.fmax.reduce(np.abs(lost) / size) * (len(t) - 1) * min(1.0, memory)
     return float(off) if off < math.inf else 0.0
 
 
@@ -436,7 +514,7 @@ def _too_fast(outcome: Outcome, integrator: FixedStep, problem: Problem) -> str:
     times, ends = [problem.t0, float(outcome.t[-1])], [to_numpy(y) for y in (problem.y0, outcome.y[-1])]
     rate = rate_of_motion(problem.system.between_impulses, times, ends)
     dt = integrator.step_length(problem.system)
-    if not _misses(integrator, np.array([dt * rate])).any():
+    if not rate or not _misses(integrator, np.array([dt * rate])).any():
         return ""
     most = float(PHASES[_misses(integrator, PHASES)][0])
     return (
@@ -448,8 +526,9 @@ def _too_fast(outcome: Outcome, integrator: FixedStep, problem: Problem) -> str:
 
 def _misses(integrator: FixedStep, z: np.ndarray) -> np.ndarray:
     """True for oscillations of z radians in a step that a method does not follow, (n,)."""
-    error = np.abs(integrator.multiplier(z) - np.exp(1j * z))
-    return (error > PHASE_ERROR * z) | ((error > 0) & (z >= PHASES[-1]))
+    with np.errstate(all="ignore"):
+        error = integrator.oscillation_error(z)
+    return (error > TOO_LONG) | ((error > 0) & (z >= PHASES[-1]))
 
 
 def note_singularities(outcome: Outcome, integrator: Integrator, problem: Problem, told: bool = False) -> None:
@@ -561,13 +640,25 @@ def _tail_states(
     return t, y
 
 
+def _increment(
+    system: HamiltonianSystem, t: np.ndarray, y: np.ndarray, h: np.ndarray, first: np.ndarray | None = None
+) -> tuple[np.ndarray, list[np.ndarray]]:
+    """The mean slope of steps h (...) of DOP853 from states (..., 2d) at t (...), and its slopes; `first` if known."""
+    from scipy.integrate import DOP853
+
+    K = [system.vector_field(y, t) if first is None else first]
+    for c, row in zip(DOP853.C[1:], DOP853.A[1 : len(DOP853.B)], strict=False):
+        stage = y + h[..., None] * sum(a * k for a, k in zip(row, K, strict=False) if a)
+        K.append(system.vector_field(stage, t + c * h))
+    return sum(b * k for b, k in zip(DOP853.B, K, strict=True) if b), K
+
+
 def _end_of_solution(
     system: HamiltonianSystem, t: np.ndarray, y: np.ndarray, end: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Times at which solutions from y (n, 2d) at t (n,) become infinite, or NaN; which reach `end`; which are open."""
     from scipy.integrate import DOP853
 
-    A, B, E3, E5 = DOP853.A, DOP853.B, DOP853.E3, DOP853.E5
     n, d, begin = len(t), system.ndof, t.copy()
     h = (end - t) / 100
     f = system.vector_field(y)
@@ -578,14 +669,13 @@ def _end_of_solution(
         i = np.flatnonzero(running)
         if not len(i):
             break
-        step, K = h[i, None], [f[i]]
-        for row in A[1 : len(B)]:
-            K.append(system.vector_field(y[i] + step * sum(a * k for a, k in zip(row, K, strict=False) if a)))
-        y_new = y[i] + step * sum(b * k for b, k in zip(B, K, strict=True) if b)
+        step = h[i, None]
+        slope, K = _increment(system, t[i], y[i], h[i], f[i])
+        y_new = y[i] + step * slope
         K.append(system.vector_field(y_new))
         scale = RTOL * np.repeat(np.maximum(_sizes(y[i], d), _sizes(y_new, d)), d, axis=1)
         scale[scale == 0] = RTOL
-        e5, e3 = (((step * sum(e * k for e, k in zip(E, K, strict=True))) / scale) for E in (E5, E3))
+        e5, e3 = (((step * sum(e * k for e, k in zip(E, K, strict=True))) / scale) for E in (DOP853.E5, DOP853.E3))
         s5, s3 = (e5**2).mean(-1), (e3**2).mean(-1)
         error = np.where(s5 + s3 == 0, 0.0, s5 / np.sqrt(s5 + 0.01 * s3))
         good = (error <= 1) & np.isfinite(y_new).all(-1) & np.isfinite(K[-1]).all(-1)
@@ -650,7 +740,7 @@ def warn_of_leap(outcome: Outcome, system: HamiltonianSystem, y0: Array) -> bool
     after = f"between t = {outcome.t[first - 1]:.10g} and {outcome.t[first]:.10g}" if first else "by the first output"
     which = "" if len(leapt) == 1 else f" of trajectory {row}, the first of {leapt.sum()},"
     warn(
-        f"The energy{which} went from {H0:.6g} to {H:.6g} over a singularity of V, and the run means nothing after "
+        f"The energy{which} went from {H0:.6g} to {H:.6g} over a singularity of V, and the run is meaningless after "
         f"that. It was lost {after}, where {system.definition.leap(along[first], start)}.",
         RuntimeWarning,
     )

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, cast
 import numpy as np
 
 from sympflow.arguments import check_flag
-from sympflow.arrays import Array, is_tensor, to_numpy, transformed, untransformed
+from sympflow.arrays import Array, as_tensor, is_tensor, to_numpy, transformed, untransformed
 from sympflow.flow.known import UNCOMPENSATED, KnownFlow
 from sympflow.flow.shipped import check_tol, choose, forces_saved, named, shipped_flows
 from sympflow.hamiltonian.fingerprint import Identity
@@ -30,8 +30,9 @@ from sympflow.integrators.clocks import (
 from sympflow.integrators.contract import Failure, Outcome, Problem, Steps
 from sympflow.integrators.domain_exit import check_start
 from sympflow.integrators.grid_runs import grid_run
+from sympflow.integrators.loops import compiled_loops, with_loops
 from sympflow.integrators.registry import is_flow
-from sympflow.integrators.steppers import ArraySteps, Stepper, compiled_loops, rollout
+from sympflow.integrators.steppers import ArraySteps, Stepper, rollout
 from sympflow.kernels.protocol import RunCheckpoint
 from sympflow.lazy import kept
 
@@ -72,7 +73,7 @@ def _shipped(system: HamiltonianSystem, name: str, tolerance: float | None) -> K
 
 
 def checked_flow(flow: Any, kind: str, what: str) -> Any:
-    """The flow that was given, or the one that ships under the name that was given; a TypeError if it is none."""
+    """The flow that was given, or the one that ships under that name; a TypeError for anything else."""
     if isinstance(flow, str):
         name = flow
         flow = known((name,), lambda: named(name).load())
@@ -147,7 +148,7 @@ class FlowIntegrator(FixedStep):
         flow = self.flow_for(system)
         if y.dtype == np.float64 and flow.dtype == torch.float64 and flow.device.type == "cpu":
             return flow
-        tensor = y if is_tensor(y) else torch.from_numpy(np.empty(0, y.dtype))
+        tensor = as_tensor(y[..., :0])
         if tensor.dtype == flow.dtype and tensor.device == flow.device:
             return flow
         if self.flow is None:
@@ -162,9 +163,9 @@ class FlowIntegrator(FixedStep):
         raise ValueError(f"`y0` is on {tensor.device}, but the flow is on {flow.device}: move one of them.")
 
     def kernel(self, flow: KnownFlow, problem: Problem) -> Any:
-        """The compiled loops of the flow, or None where the call needs, or asks for, array operations."""
+        """The compiled loops of the flow, or None where the call needs array operations or `backend` chooses them."""
         system = None
-        if is_tensor(problem.y0) and str(problem.y0.dtype) == "torch.float64":  # for float32 there is another flow
+        if str(problem.y0.dtype) == "torch.float64":  # for float32 there is another flow
             weights = [*cast(Any, flow).parameters()]
             learns = any(x.requires_grad for x in weights) or transformed(*weights)
             system = None if learns else problem.system
@@ -176,10 +177,10 @@ class FlowIntegrator(FixedStep):
         if type(problem.y0) is np.ndarray and problem.y0.dtype == np.float64:  # a kernel tells the flow's own dtype
             kernel = self.kernel(flow, problem)
             if kernel is not None:
-                return Stepper(self, problem, FlowSteps(flow, True), kernel)
+                return with_loops(self, problem, FlowSteps(flow, True), kernel)
         flow = self.flow_like(problem.system, problem.y0)
         kernel = self.kernel(flow, problem)
-        return Stepper(self, problem, FlowSteps(flow, kernel is not None), kernel)
+        return with_loops(self, problem, FlowSteps(flow, kernel is not None), kernel)
 
     def run(self, problem: Problem) -> Outcome:
         run = grid_run(self, problem)
@@ -440,7 +441,7 @@ class LogSympFlow(FixedStep):
         found = [f for f in shipped_flows(system, "sympflow") if f.shift is not None]
         if not found:
             raise ValueError(
-                f"`flow` is needed, for none in another time ships for {system.name!r}: train one on "
+                f"`flow` is needed: no flow in another time ships for {system.name!r}: train one on "
                 "sympflow.time_transformed(system), or prime one with it, and pass it; or use 'log_leapfrog'."
             )
         return replace(self, flow=found[0].load(system), shift=found[0].shift if self.shift is None else self.shift)

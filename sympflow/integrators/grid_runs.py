@@ -64,7 +64,7 @@ class Run(ABC):
 
     @abstractmethod
     def windows(self) -> Iterator[float]:
-        """Make the steps, window by window; tell the time that has elapsed after each."""
+        """Make the steps, window by window; yield the time that has elapsed after each."""
 
     @abstractmethod
     def taken(self) -> Outcome:
@@ -217,7 +217,7 @@ def report_lanes(outcome: Outcome, ok: np.ndarray, breakdown: Failure) -> None:
     outcome.stats["failed_at"] = float(outcome.t[int(np.argmin(ok.reshape(len(ok), -1).all(1)))])
     outcome.message = (
         f"{what} in some lane of torch.func.vmap before t = {outcome.stats['failed_at']:.15g}. {remedy}, or pass the "
-        "states as a batch, whose trajectories are told apart."
+        "states as a batch, whose trajectories are distinguished."
     )
 
 

@@ -16,7 +16,8 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.times import stage_time
 from sympflow.integrators.base import FixedStep
 from sympflow.integrators.contract import Failure, Problem, method_class
-from sympflow.integrators.steppers import ArraySteps, Stepper, stepper_of
+from sympflow.integrators.loops import stepper_of
+from sympflow.integrators.steppers import ArraySteps, Stepper
 
 _BUTCHER = "J. C. Butcher, Implicit Runge–Kutta processes, Math. Comp. 18 (1964) 50–64"
 _SYMPLECTIC = (
@@ -88,9 +89,8 @@ class Gauss(FixedStep):
         sizes = collocation.variable_sizes(y, K, 0 * M[..., 0])
         dK = collocation.solved(M, slopes, sizes).reshape(*y.shape[:-1], s, n, n)
         J = np.eye(n, dtype=y.dtype) + np.einsum("i,...ijk->...jk", b, dK)
-        if system.friction:
-            E = collocation.decays(system, h[..., 0])
-            J = np.concatenate([J[..., : n // 2, :], E @ J[..., n // 2 :, :]], axis=-2)
+        E = collocation.decays(system, h[..., 0])
+        J = np.concatenate([J[..., : n // 2, :], E @ J[..., n // 2 :, :]], axis=-2)
         return collocation.advanced(system, self.tableau, y, K, h), J
 
     def own_stepper(self, problem: Problem) -> Stepper:

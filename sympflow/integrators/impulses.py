@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from sympflow.arrays import Array, concatenate
+from sympflow.hamiltonian.definition import ASIDE
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.contract import Integrator, Interrupted, Outcome, Problem, finished, interrupted
 from sympflow.integrators.grid import EPS
@@ -18,16 +19,14 @@ from sympflow.integrators.grid import EPS
 Run = Callable[[Integrator, Problem], tuple[Outcome, Problem]]
 MOST_LANDINGS = 20_000  # jumps at which a run is cut; one with more is not, and warns
 MOST_KINKS = 5000
-ASIDE = 64 * EPS
-"""Share of the times between which a run goes on from a jump, or ends before it, so that H is that of one side."""
 
 
 def landings(
-    integrator: Integrator, system: HamiltonianSystem, t0: float, t1: float, able: bool = True, kinks: bool = False
+    integrator: Integrator, system: HamiltonianSystem, t0: float, t1: float, able: bool = True, kinks: bool = True
 ) -> tuple[str, list[float]]:
     """The warning of a run that loses its order at jumps of H in t; or, if it is `able`, those at which it is cut.
 
-    By fixed steps of more than second order it is cut at `kinks` of H too.
+    By fixed steps of more than second order it is cut at kinks of H too, or, without `kinks`, warned of them.
     """
     if not system.definition.may_jump or not math.isfinite(t1) or t0 == t1:
         return "", []
@@ -56,13 +55,19 @@ def landings(
                 f"at one, at t = {times[0]:.6g}: it is of first order there. Use one that takes none, such as "
                 "'leapfrog', 'kahan_li8' or 'gauss_legendre6'."
             )
+    cuts = [(times, False)] if said else []
+    if dt is not None and (integrator.order or 0) > 2:
+        bends = system.jump_times(min(t0, t1), max(t0, t1), step, True)
+        if len(within := _within(bends, t0, dt)):
+            said = said or (
+                f"`dt` {dt:g}: H of {system.name!r} has a kink in t within a step, at t = "
+                f"{within[0 if t1 > t0 else -1]:.6g}, where method {integrator.name!r} of order {integrator.order} is "
+                "of second. Choose a `dt` that divides all pieces between kinks from t0 on, or solve from kink to kink."
+            )
+            if kinks and len(bends) <= MOST_KINKS:
+                cuts.insert(0, (sorted({*bends.tolist(), *times}), True))
     if not able or integrator.forces_beyond(system):
         return said, []
-    cuts = [(times, False)] if said else []
-    if kinks and dt is not None and (integrator.order or 0) > 2:
-        bends = system.jump_times(min(t0, t1), max(t0, t1), step, True)
-        if len(_within(bends, t0, dt)) and len(bends) <= MOST_KINKS:
-            cuts.insert(0, (sorted({*bends.tolist(), *times}), True))
     for met, bent in cuts:  # all times must be known: `jump_times` may list the first ones alone
         if 0 < len(met) <= MOST_LANDINGS and not len(system.jump_times(max(met), max(t0, t1), step, bent)):
             return "", met
@@ -99,7 +104,7 @@ def spans(t0: float, t1: float, ends: Collection[float], jumps: Sequence[float])
 
 def pieces_of(integrator: Integrator, system: HamiltonianSystem, t0: float, t1: float) -> list[tuple[float, float]]:
     """The pieces of a run of a system without impulses."""
-    return [piece[:2] for piece in spans(t0, t1, [], landings(integrator, system, t0, t1, kinks=True)[1])]
+    return [piece[:2] for piece in spans(t0, t1, [], landings(integrator, system, t0, t1)[1])]
 
 
 def run_in_pieces(

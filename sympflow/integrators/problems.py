@@ -24,7 +24,7 @@ _FLOAT64 = np.dtype(np.float64)
 
 
 def check_backend(backend: Any, integrator: Integrator) -> None:
-    """Raise ValueError if it is none, or none of the method."""
+    """Raise ValueError if it is not an initial state of the system, or if the method cannot take it."""
     if not isinstance(backend, str) or backend not in BACKENDS:
         raise ValueError(
             f"`backend` must be one of {', '.join(map(repr, BACKENDS))}; got {backend!r}: for a GPU pass tensors on it."
@@ -109,8 +109,8 @@ def check_own_parameters(system: HamiltonianSystem, values: Mapping[str, ArrayLi
     symbols = system.symbols
     if values and symbols is not None and symbols.time is not symbols.named_time:
         raise ValueError(
-            "`params` are those of a driven system, and the values that `system` has make it constant in time: pass "
-            "one whose H depends on t, as by system.with_params(...)."
+            "`params` would make H depend on t, but with the values of `system` it does not: pass a system whose H "
+            "depends on t, as by system.with_params(...)."
         )
     if not integrator.trained:
         return
@@ -190,11 +190,13 @@ def check_stored(problem: Problem, action: str, rows: ParameterRows | None) -> N
     check_array(problem.y0, "a `store` takes NumPy states, for it keeps no gradients", "y0.detach().numpy()")
     if problem.events is not None and problem.events.events:
         raise ValueError(
-            "`store` takes no `events`, whose zeros are kept in memory: store the outputs, and look for the zeros in "
-            "them, or leave `store` out."
+            "`store` does not go with `events`, whose zeros are kept in memory: store the outputs, and look for the "
+            "zeros in them, or leave `store` out."
         )
     if problem.dense_output:
-        raise ValueError("`store` has no `dense_output`, which keeps every step in memory: choose times by `t_eval`.")
+        raise ValueError(
+            "`store` does not go with `dense_output`, which keeps every step in memory: choose times by `t_eval`."
+        )
     if action == "stop":
         raise ValueError("`store` takes no `on_domain_exit` 'stop': use 'warn'.")
     if rows is not None and not rows.uniform:

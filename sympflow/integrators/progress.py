@@ -14,7 +14,7 @@ WIDTH = 24  # characters of the bar
 
 
 class Progress:
-    """Progress of one call: the part of a total that is done, as it is told."""
+    """Progress of one call: the part of a total that is done, as reported."""
 
     def __init__(self, asked: Asked, total: Any, told: Callable[[Any], str]) -> None:
         check_progress(asked)

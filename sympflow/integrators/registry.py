@@ -169,7 +169,7 @@ def register(name: str, integrator: type[Integrator] | Scheme) -> None:
         raise TypeError(f"`integrator` {integrator.__name__} has no `name`: set that class attribute.")
     if name in _plugins():
         raise ValueError(
-            f"`name` {name!r} is that of the plug-in {distribution(_plugins()[name])}, which would be replaced: "
+            f"`name` {name!r} belongs to the plug-in {distribution(_plugins()[name])}, which would be replaced: "
             "choose another name."
         )
     if scheme is not None:
@@ -293,8 +293,8 @@ class naming_plugin:
 def check_applies(integrator: Integrator, system: HamiltonianSystem, y0: Array | None = None) -> None:
     """`integrator.check(system)`: a ValueError says that the method does not apply; a plug-in that fails is named.
 
-    The functions of a user's system are tested too, for states such as y0. Friction, forces that are none of H, and H
-    that depends on t are refused here for every method that does not say that it takes them.
+    The functions of a user's system are tested too, for states such as y0. Friction, forces that do not come from H,
+    and an H that depends on t are refused here for every method that does not declare that it takes them.
     """
     system.check_impulses(
         "which are kicks between the steps of a method",
@@ -304,7 +304,7 @@ def check_applies(integrator: Integrator, system: HamiltonianSystem, y0: Array |
     mro = type(integrator).__mro__
     if system.external_force is not None and not (integrator.takes_forces and _speaks_itself(mro, "takes_friction")):
         system.check_conservative(f"which method {integrator.name!r} does not take", "")
-    if system.friction and not (integrator.takes_friction and _speaks_itself(mro, "takes_friction")):
+    if not system.conservative and not (integrator.takes_friction and _speaks_itself(mro, "takes_friction")):
         what = "was trained without it" if integrator.trained else "does not take it"
         system.check_conservative(
             f"and method {integrator.name!r} {what}",
@@ -312,7 +312,7 @@ def check_applies(integrator: Integrator, system: HamiltonianSystem, y0: Array |
             "such as 'gauss_legendre6', or a Runge–Kutta method such as 'dop853' or 'dopri5', or solve the system "
             "that sympflow.doubled makes of it",
         )
-    if not (system.autonomous or (integrator.takes_driving and _speaks_itself(mro, "takes_driving"))):
+    if not system.autonomous and not (integrator.takes_driving and _speaks_itself(mro, "takes_driving")):
         what = "was trained for a system without t" if integrator.trained else "does not take the time into account"
         system.check_autonomous(
             f"and method {integrator.name!r} {what}",

@@ -108,8 +108,8 @@ class _Scipy(RungeKutta):
             finite = bool(np.isfinite(system.vector_field(y0.astype(float), t0)).all())
         if finite and self.atol == 0 and (y0 == 0).any():
             return (
-                f"There is no first step from t = {t0:.15g}: `atol` is 0, and `y0` has components that are 0, of which "
-                "a relative error has no meaning. Give an `atol`, such as `rtol` times the size of the state."
+                f"There is no first step from t = {t0:.15g}: `atol` is 0, and `y0` has components that are 0, "
+                "for which a relative error has no meaning. Give an `atol`, such as `rtol` times the size of the state."
             )
         what = "first step" if finite else "vector field"
         return f"The {what} is not finite at t = {t0:.15g}. Check `y0` and its scale{', or raise `atol`' * finite}."
@@ -209,7 +209,7 @@ class _Scipy(RungeKutta):
         return outcome
 
     def steps(self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array) -> Steps:
-        """The realised steps. In a batch the trajectories advance in parallel; one that has ended waits with h = 0."""
+        """The realised steps. Trajectories of a batch advance in parallel; those that have ended get h = 0."""
         y, going = np.array(y0, dtype=float), np.full(y0.shape[:-1], t_span[0] != t_span[1]).reshape(-1)
         for piece in pieces_of(self, system, *t_span):
             y = yield from self._steps(system, piece, y, going)

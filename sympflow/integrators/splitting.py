@@ -28,8 +28,9 @@ from sympflow.integrators.contract import (
     method_class,
 )
 from sympflow.integrators.interpolants import Mapped
+from sympflow.integrators.loops import compiled_loops, stepper_by_mass, stepper_of
 from sympflow.integrators.methods import NAMES, TRIPLES
-from sympflow.integrators.steppers import Stepper, compiled_loops, stepper_of
+from sympflow.integrators.steppers import Stepper
 from sympflow.schemes import CORRECTORS, POLYNOMIAL, SCHEMES, Scheme, checked_scheme, scheme_evaluations, scheme_named
 
 if TYPE_CHECKING:
@@ -228,10 +229,10 @@ class Splitting(FixedStep):
         plain = self.splitting == "kinetic" and self.clock == "physical" and not self.overrides("step")
         return self.scheme if plain else None
 
-    def multiplier(self, z: np.ndarray) -> np.ndarray:
+    def oscillation_error(self, z: np.ndarray) -> np.ndarray:
         scheme = self.kicks_and_drifts
         if scheme is None or scheme.level == POLYNOMIAL:
-            return super().multiplier(z)
+            return super().oscillation_error(z)
         q, p, x = np.array([1 + 0 * z, 0 * z]), np.array([0 * z, 1 + 0 * z]), z**2  # q and hp of two orbits
         for kind, b, g, c, *_ in scheme.substeps:
             if kind == "drift":
@@ -240,7 +241,11 @@ class Splitting(FixedStep):
                 p = p - (b * x - g * x**2 + c * x**3) * q
         half_trace = (q[0] + p[1]) / 2
         root = np.emath.sqrt(half_trace**2 - 1)
-        return half_trace + np.where(np.sin(z) < 0, -root, root)
+        multiplier = half_trace + np.where(np.sin(z) < 0, -root, root)
+        # A step keeps an ellipse in (zq, hp), on which the energy, half the squared radius, changes.
+        mean, half_change = (z * q[1] - p[0] / z) / 2, np.hypot(z * q[1] + p[0] / z, p[1] - q[0]) / 2
+        swing = np.where(mean > half_change, 2 * half_change / (mean - half_change), np.inf)
+        return np.maximum(np.abs(multiplier - np.exp(1j * z)) / z, swing)
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
         """Count those of a scheme of kicks and drifts; a stepper counts those of other parts too."""
@@ -354,6 +359,9 @@ class Splitting(FixedStep):
 
     def own_stepper(self, problem: Problem) -> Stepper:
         composition, compensated = self.composed(problem.system), bool(self.compensated)
+        by_mass = stepper_by_mass(self, problem, composition, partial(composition.kernel_by, compensated))
+        if by_mass is not None:
+            return by_mass
         make = composition.kernel_by if problem.followed else composition.kernel
         return stepper_of(self, problem, composition, partial(make, compensated), compensated)
 
@@ -435,8 +443,8 @@ def _note_distance(extension: Composition, found: np.ndarray, outcome: Outcome) 
         which = "" if lost.ndim == 0 else f" of {np.count_nonzero(lost)} of {lost.size} trajectories"
         warn(
             f"The two copies{which} that method {extension.method!r} keeps differ by up to {largest:.3g} of the size "
-            "of the states: these say little about the system. Reduce `dt`, or change `omega`, the strength by which "
-            "the copies are bound.",
+            "of the states, which makes the result unreliable. Reduce `dt`, or change `omega`, the strength that "
+            "binds the copies.",
             RuntimeWarning,
         )
 
@@ -488,7 +496,7 @@ def splitting_method(
     Raises
     ------
     TypeError
-        If `scheme` is no scheme, or `name` no string.
+        If `scheme` is not a `Scheme`, or `name` not a string.
     ValueError
         If there is no such scheme, splitting or clock; if the scheme is not consistent; or if the name is that of
         another, built-in method.

@@ -10,17 +10,16 @@ import numpy as np
 
 from sympflow.arrays import (
     Array,
+    copied,
     differentiable,
     finite_states,
     full_of_nan,
-    is_tensor,
     library_name,
     like,
     stack,
     transformed,
     with_rows,
 )
-from sympflow.compiler import NotCompiled
 from sympflow.integrators.contract import Problem
 from sympflow.integrators.grid import Grid
 from sympflow.kernels.protocol import RunCheckpoint
@@ -112,10 +111,6 @@ class Stepper:
         """
         if self.kernel is None:
             return self.arrays.rollout(y0, h, n_steps, save, t0, carry)
-        if is_tensor(y0):
-            from sympflow.integrators.tensors import rolled_out
-
-            return rolled_out(self, y0, h, n_steps, save, t0, carry)
         rows = y0 if y0.ndim == 1 else y0.reshape(-1, y0.shape[-1])
         states, last, iterations = self.kernel.run(h, rows, n_steps, save, carry, t0)
         self.remark = self.kernel.remark
@@ -128,10 +123,6 @@ class Stepper:
         """Return the states a step of length h, a number or one for each state, after y (..., 2d) at the time t."""
         if self.kernel is None:
             return self.arrays.step(y, h, t)
-        if is_tensor(y):
-            from sympflow.integrators.tensors import stepped
-
-            return stepped(self, y, h, t)
         self.arrays.check_lengths(h)
         times = t if np.ndim(t) == 0 else np.broadcast_to(t, y.shape[:-1]).reshape(-1)
         rows = y if y.ndim == 2 else np.ascontiguousarray(y).reshape(-1, y.shape[-1])
@@ -149,87 +140,6 @@ class Stepper:
         return arrays.evaluations(n_steps, n_saved, n_extra, self.backend) if known is None else dict(known)
 
 
-def stepper_of(
-    integrator: Any, problem: Problem, arrays: ArraySteps, make: Callable[..., Any], compensated: bool = False
-) -> Stepper:
-    """Return the stepper of the loops that `make` gives, for names of parameters where gradients flow to these."""
-    if problem.followed:
-        return Stepper(integrator, problem, arrays, _followed_loops(make, problem))
-    told: list[str] = []
-    kernel = compiled_loops(make, problem.y0, problem.backend, compensated, told, problem.system)
-    if problem.parameter_values is not None:
-        kernel = kernel.varied(problem.parameter_values)
-    return Stepper(integrator, problem, arrays, kernel, told)
-
-
-def compiled_loops(
-    make: Callable[[], Any],
-    y0: Array,
-    backend: str,
-    compensated: bool = False,
-    told: list[str] | None = None,
-    system: Any = None,
-) -> Any:
-    """Return the compiled loops that `make` gives, or None where the call needs, or asks for, array operations.
-
-    Tensors need these, except on the CPU where the `system` is given.
-    """
-    reason = None
-    if backend == "array":
-        reason = "`backend` is 'array': choose 'auto'."
-    elif is_tensor(y0):
-        reason = _no_loops_for(y0, system)
-    elif y0.dtype != np.float64:
-        reason = f"`y0` is {y0.dtype}: use float64, or backend='array'."
-    asked = reason is None
-    if reason is None:
-        try:
-            loops = make()
-            if differentiable(y0):
-                loops.check_reverse()
-            return loops
-        except NotCompiled as error:
-            reason = str(error)
-    if backend == "compiled":
-        raise ValueError(f"`backend` {backend!r} does not apply. {reason}") from None
-    if compensated:
-        needed = "" if reason.startswith("`compensated`") else "`compensated` sums need compiled loops. "
-        raise ValueError(needed + reason) from None
-    if told is not None and backend == "auto" and asked:
-        told.append(reason)
-    return None
-
-
-def _followed_loops(make: Callable[[tuple[str, ...]], Any], problem: Problem) -> Any:
-    """The compiled loops, that `make` gives for names, of a run through which gradients flow to parameters."""
-    names, array = tuple(problem.followed), problem.backend == "array"
-    try:
-        if reason := "`backend` is 'array'." if array else _no_loops_for(problem.y0, problem.system):
-            raise NotCompiled(reason)
-        if problem.system.symbols is None:
-            raise NotCompiled(f"`system` {problem.system.name!r} is not symbolic.")
-        loops = make(names)
-        loops.check_reverse()
-        return loops.varied(problem.parameter_values)
-    except NotCompiled as error:
-        raise ValueError(
-            f"`params` has {', '.join(names)}, to which no gradient flows: {error} Detach them."
-        ) from error
-
-
-def _no_loops_for(y0: Array, system: Any) -> str | None:
-    """Why a tensor needs array operations, if it does."""
-    if system is None:
-        return "`y0` is a tensor: pass a NumPy array, or use backend='array'."
-    if y0.device.type != "cpu":
-        return f"`y0` is on {y0.device}: move it to the CPU, or use backend='array'."
-    if transformed(y0):
-        return "`y0` is followed by torch.func, forward mode or torch.compile: use backend='array'."
-    if system.layered is None and system.learns(y0):
-        return "`system` has numbers that torch follows: use backend='array'."
-    return None
-
-
 def rollout(
     step: Callable[[int, Array], Array],
     y: Array,
@@ -242,25 +152,17 @@ def rollout(
     k = 0
     if carry is not None and carry.running is not None:
         k, y = carry.steps, carry.running
-    tensor = is_tensor(y)
-    out: Any = [] if tensor else np.full((len(save), *y.shape), np.nan, dtype=y.dtype)
-    wanted = save.tolist()
-    position = 0
+    out, wanted = [], save.tolist()
     finite = np.where(finite_states(y, in_any_lane=True), n_steps, -1)
     if wanted and wanted[0] == 0:
-        out.append(y) if tensor else out.__setitem__(0, y)
-        position = 1
+        out.append(copied(y))
     with np.errstate(all="ignore"):
         while k < n_steps and (finite == n_steps).any():
             start, y_start = k, y
             for k in range(start, min(start + block, n_steps)):
                 y = checked_state(step(k, y), y)
-                if position < len(wanted) and wanted[position] == k + 1:
-                    if tensor:
-                        out.append(y)
-                    else:
-                        out[position] = y
-                    position += 1
+                if len(out) < len(wanted) and wanted[len(out)] == k + 1:
+                    out.append(copied(y))
             k += 1
             failed = (finite == n_steps) & ~finite_states(y, in_any_lane=True)
             if failed.any():
@@ -271,17 +173,15 @@ def rollout(
                     finite = np.where(first, j, finite)
     if carry is not None:
         carry.advance(n_steps, y)
-    if tensor:
-        out += [full_of_nan(y)] * (len(wanted) - len(out))
-        out = stack(out, axis=0) if out else y[None][:0]
-    return out, np.asarray(finite)
+    out += [full_of_nan(y)] * (len(wanted) - len(out))
+    return stack(out, axis=0) if out else y[None][:0], np.asarray(finite)
 
 
 def checked_state(y_next: Any, y: Array) -> Array:
     """Return the result of a step from y, checked to be of the same kind, shape and dtype: it may be a plug-in's."""
     shape = getattr(y_next, "shape", None)
     if shape == y.shape and y_next.dtype == y.dtype:
-        if is_tensor(y) and differentiable(y) and not (y_next.requires_grad or transformed(y)):
+        if differentiable(y) and not (y_next.requires_grad or transformed(y)):
             raise TypeError(
                 "`step` loses the gradient of the tensors that it is given: pass NumPy arrays, or y0.detach(). A class "
                 "whose step takes arrays only says so by `arrays_only`."

@@ -11,34 +11,36 @@ from torch import Tensor
 
 from sympflow.arguments import check_not_followed
 from sympflow.arrays import detached, differentiable, to_numpy, transformed
+from sympflow.integrators.steppers import Stepper
 from sympflow.kernels.protocol import RunCheckpoint, Task
 
 
-def rolled_out(
-    stepper: Any, y0: Tensor, h: float, n_steps: int, save: np.ndarray, t0: float, carry: RunCheckpoint | None
-) -> tuple[Tensor, np.ndarray]:
-    """`Stepper.rollout` of a tensor on the CPU: float32 is computed in double, and rounded at the outputs."""
-    if y0.dtype != torch.float64:
-        states, finite = rolled_out(stepper, y0.double(), h, n_steps, save, t0, carry)
-        return states.to(y0.dtype), finite
-    followed = stepper.followed
-    if not differentiable(y0, *followed):
-        found, finite = stepper.rollout(to_numpy(y0), h, n_steps, save, t0, carry)
-        return torch.from_numpy(found), finite
-    run = _Rolled(stepper, h, n_steps, save, t0)
-    return _Run.apply(run, y0, *followed), run.finite
+class TensorStepper(Stepper):
+    """Compiled loops for tensors on the CPU: float32 is computed in double, and rounded at the outputs."""
 
+    def rollout(
+        self, y0: Tensor, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0, carry: RunCheckpoint | None = None
+    ) -> tuple[Tensor, np.ndarray]:
+        if y0.dtype != torch.float64:
+            states, finite = self.rollout(y0.double(), h, n_steps, save, t0, carry)
+            return states.to(y0.dtype), finite
+        followed = self.followed
+        if not differentiable(y0, *followed):
+            found, finite = super().rollout(to_numpy(y0), h, n_steps, save, t0, carry)
+            return torch.from_numpy(found), finite
+        run = _Rolled(self, h, n_steps, save, t0)
+        return _Run.apply(run, y0, *followed), run.finite
 
-def stepped(stepper: Any, y: Tensor, h: Any, t: Any) -> Tensor:
-    """`Stepper.shorter` of tensors, differentiable by their lengths too."""
-    _check_steps(stepper)
-    if transformed(y, h):
-        return _by_arrays(stepper, y, h, t, *stepper.followed)
-    if y.dtype != torch.float64:
-        h = h.double() if isinstance(h, Tensor) else h
-        return stepped(stepper, y.double(), h, t).to(y.dtype)
-    h = torch.as_tensor(h, dtype=y.dtype).expand(y.shape[:-1])
-    return _Step.apply(stepper, t, y, h, *stepper.followed)
+    def shorter(self, y: Tensor, h: Any, t: Any = 0.0) -> Tensor:
+        """Return the states a step of length h after y, differentiable by their lengths too."""
+        _check_steps(self)
+        if transformed(y, h):
+            return _by_arrays(self, y, h, t, *self.followed)
+        if y.dtype != torch.float64:
+            h = h.double() if isinstance(h, Tensor) else h
+            return self.shorter(y.double(), h, t).to(y.dtype)
+        h = torch.as_tensor(h, dtype=y.dtype).expand(y.shape[:-1])
+        return _Step.apply(self, t, y, h, *self.followed)
 
 
 class MovingTimes:
@@ -81,7 +83,7 @@ class MovingTimes:
 def _moved(system: Any, y: Tensor, t: Tensor, at: Any, sign: float = 1.0) -> Tensor:
     """The same states y (..., 2d) at times t, whose values are `at`, with the derivative by these, or less that."""
     system = system.between_impulses  # which are at times of their own
-    field = system.vector_field(y, None if system.autonomous else torch.as_tensor(at).expand(y.shape[:-1]))
+    field = system.vector_field(y, torch.as_tensor(at).expand(y.shape[:-1]))
     return y + sign * field * (t - t.detach()).to(y)[..., None]
 
 
@@ -150,7 +152,7 @@ class _Step(torch.autograd.Function):
     def forward(ctx: Any, stepper: Any, t: Any, y: Tensor, h: Tensor, *followed: Tensor) -> Tensor:
         ctx.step = lambda y, h, *numbers: _by_arrays(stepper, y, h, t, *numbers)
         ctx.save_for_backward(y, h, *followed)
-        return torch.from_numpy(stepper.shorter(to_numpy(y), to_numpy(h), t))
+        return torch.from_numpy(Stepper.shorter(stepper, to_numpy(y), to_numpy(h), t))
 
     @staticmethod
     def backward(ctx: Any, cotangents: Tensor) -> tuple[Any, ...]:

@@ -32,8 +32,9 @@ from sympflow.integrators.contract import (
 from sympflow.integrators.grid import Grid
 from sympflow.integrators.impulses import pieces_of
 from sympflow.integrators.interpolants import THIRDS, Batch, Interpolant, Piecewise
+from sympflow.integrators.loops import stepper_of
 from sympflow.integrators.runge_kutta import ExplicitStep, RungeKutta, hopeless, weighted
-from sympflow.integrators.steppers import Stepper, stepper_of
+from sympflow.integrators.steppers import Stepper
 from sympflow.integrators.tableaux import ADAPTIVE, FIXED, MULTISTEP, Tableau
 
 Visit = Callable[[Interpolant], bool]  # takes a step as soon as it is accepted; whether the run ends in it
@@ -68,7 +69,7 @@ class Trace:
         return self.t_span[0] + self.direction * s.double()
 
     def evaluated(self, y: Any, f: Any) -> None:
-        """Called with the slope f at each state y where torchdiffeq asks for it."""
+        """Called with the slope f at each state y where torchdiffeq evaluates it."""
 
     def array(self, x: Any) -> Array:
         """A tensor of torchdiffeq's as what the user gave."""
@@ -528,11 +529,11 @@ class FixedGrid(ExplicitStep, FixedStep):
         make = partial(self.compiled, problem.system, "explicit_kernel", self.tableau)
         return stepper_of(self, problem, OwnSteps(self, problem), make)
 
-    def multiplier(self, z: np.ndarray) -> np.ndarray:
+    def oscillation_error(self, z: np.ndarray) -> np.ndarray:
         K: list[np.ndarray] = []
         for row in self.A[: len(self.B)]:
             K.append(1j * z * (1 + (weighted(row, K) if K else 0.0)))
-        return 1 + weighted(self.B, K)
+        return np.abs(1 + weighted(self.B, K) - np.exp(1j * z)) / z
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
         return {"force_evaluations": len(self.B) * (n_steps + n_extra), "hessian_evaluations": 0}

@@ -81,8 +81,8 @@ class Path:
         return self.step(states, _each(r.to(states.dtype), states), self.times(count, states))
 
     def times(self, count: Tensor, states: Tensor) -> Any:
-        """The times (n, ...) of states (n, ..., 2d) after `count` (n,) steps, of a driven system."""
-        return _each(self.t0 + count.to(torch.float64) * self.h, states) if self.driven else 0.0
+        """The times (n, ...) of states (n, ..., 2d) after `count` (n,) steps."""
+        return _each(self.t0 + count.to(torch.float64) * self.h, states)
 
     def located(self, s: Tensor) -> tuple[Tensor, Tensor]:
         """Counts k of whole steps and remainders r (n,), in float64, with s = k·h + r; gradients flow from s to r.
@@ -116,7 +116,7 @@ class Path:
         y: Any = self.y0 if start is None else start
         if self.before_step is not None:
             return self._one_by_one(save)
-        n_steps, t0 = int(save.max(initial=0)), self.t0 + first * self.h if self.driven else 0.0
+        n_steps, t0 = int(save.max(initial=0)), self.t0 + first * self.h
         if isinstance(t0, Tensor):  # followed by torch, which the numbers of a run are not
             return rollout(lambda k, z: self.step(z, self.h, t0 + k * self.h), y, n_steps, save)[0]
         plain = self._plain(y)
@@ -136,13 +136,13 @@ class Path:
                 states.append(y)
             if k < save.max(initial=0):
                 self.before_step(k * self.h, y, self.h)
-                y = self.step(y, self.h, self.t0 + k * self.h if self.driven else 0.0)
+                y = self.step(y, self.h, self.t0 + k * self.h)
         return torch.stack(states)
 
     def step(self, y: Tensor, h: float | Tensor, t: Any) -> Tensor:
         """A step of length h from the time t, each a number or one for each state.
 
-        By NumPy where nothing is to be differentiated. The time is 0 where the system does not depend on it.
+        By NumPy where nothing is to be differentiated.
         """
         return self._stepped(self.integrator.step, y, h, t)
 
@@ -191,7 +191,7 @@ class Path:
         s = zero = torch.tensor(value, dtype=torch.float64, device=self.y0.device)
         count, r = self.located(zero[None])
         start, inside = self(count.to(torch.float64) * self.h)[0], float(r[0])
-        t = self.start + float(count[0]) * self.h if self.driven else 0.0
+        t = self.t0 + float(count[0]) * self.h
 
         def state(time: Tensor) -> Tensor:
             remainder = (time - zero + inside).to(start.dtype)
@@ -230,7 +230,7 @@ class Path:
                     b, y_b = start + self.h * i / parts, inner[j, i - 1] if i < parts else states[j + 1]
                     after = value(b, y_b)
                     if np.sign(before) * np.sign(after) <= 0:  # the product itself may underflow
-                        t = ahead.t0 + j * self.h if self.driven else 0.0
+                        t = ahead.t0 + j * self.h
                         return self._locate(value, start, states[j], t, (a, before), (b, after))
                     if not math.isfinite(after):
                         raise RuntimeError(
@@ -339,7 +339,7 @@ class AdjointPath(Path):
             try:
                 y = grid[i]
                 for k in range(last - 1, first, -1):
-                    y = self.inverse(y, self.t0 + k * self.h if self.driven else 0.0)
+                    y = self.inverse(y, self.t0 + k * self.h)
                     yield k, y
             except TypeError:  # there is none
                 yield from self._run_again(grid[i - 1], first, last)

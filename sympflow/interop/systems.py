@@ -21,7 +21,7 @@ TIMES = (0.0, 0.3719, 1.0, 3.14159265, 5.6, 13.7, -2.3, 51.3, 407.0, 1e4)  # whe
 def from_hamiltonian(H: Callable[[Tensor, Tensor], Tensor], ndof: int, **scene: Any) -> HamiltonianSystem:
     """The system of a callable H(q, p), written with torch functions on (..., d).
 
-    Where H turns out to be ½ pᵀM⁻¹p + V(q), as far as eight random states near y0 can tell, it is made a separable
+    Where H turns out to be ½ pᵀM⁻¹p + V(q) at eight random states near y0, it is made a separable
     system, to which the splitting methods apply. M is fixed then: where ∂H/∂p depends on tensors that require
     gradients, such as a mass that is trained, the system stays H(q, p), which gives them gradients. A run is refused
     where ∂H/∂p has changed since, as by a number that H reads from elsewhere.

@@ -14,7 +14,7 @@ from sympflow.compiler.control import DOUBLE, POINTER, Code, Rows, Value
 from sympflow.compiler.program import Program, adjoint, gradient, traced
 from sympflow.hamiltonian.formulas import Variable, recorded
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.kernels.one_steps import OneStep, OneStepKernel, is_large, lettered, parametric, terms_of
+from sympflow.kernels.one_steps import OneStep, OneStepKernel, is_large, lettered, parametric, shared_code, terms_of
 from sympflow.kernels.runs import Numbers, Room, Values, begun, finished
 from sympflow.lazy import kept
 
@@ -36,8 +36,11 @@ def explicit_kernel(system: HamiltonianSystem, tableau: Tableau, names: tuple[st
     field = field_of(system, names)
     kind = _InMemory if field.large else _InRegisters
     A = tuple(tuple(map(float, row)) for row in tableau.A)
-    code = kind(field, A, tuple(map(float, tableau.B)))
-    return OneStepKernel(code, code, field.more)
+    B = tuple(map(float, tableau.B))
+    form = field.lettered.symbols
+    plain = not (field.data or field.rates or len(field.lettered.expressions) > 1)
+    code = shared_code(form, (A, B), lambda: kind(field, A, B)) if plain else kind(field, A, B)
+    return OneStepKernel(code, code, form.values, field.more)
 
 
 def compiled_field(system: HamiltonianSystem) -> CompiledField:

@@ -23,7 +23,7 @@ from sympflow.compiler.program import Program, gradient, traced
 from sympflow.hamiltonian.collocation import MOST_ITERATIONS, Tableau, stage_nodes
 from sympflow.hamiltonian.formulas import recorded
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.kernels.one_steps import Lettered, OneStep, OneStepKernel, is_large, parametric, terms_of
+from sympflow.kernels.one_steps import Lettered, OneStep, OneStepKernel, is_large, parametric, shared_code, terms_of
 from sympflow.kernels.one_steps import lettered as with_letters
 from sympflow.kernels.rollouts import Rollouts
 from sympflow.kernels.runs import Numbers, Room, Values
@@ -60,10 +60,14 @@ def implicit_kernel(
         raise NotCompiled("`damping` is a matrix, whose decay is not compiled here: use backend='array'.")
     symbols = parametric(written, names)
     of_time = with_letters(symbols, [symbols.H])
-    code = newton_code(of_time, tableau, compensated, bool(friction))
-    single = newton_code(of_time, tableau, False, False) if compensated else code
+
+    def made(*kind: bool) -> NewtonCode:
+        return shared_code(symbols, (tableau, kind), lambda: newton_code(of_time, tableau, *kind))
+
+    code = made(compensated, bool(friction))
+    single = made(False, False) if compensated else code
     if not friction:
-        return OneStepKernel(code, single)
+        return OneStepKernel(code, single, symbols.values)
     rates = np.broadcast_to(friction.rates, system.ndof)
     exponents = np.outer([*stage_nodes(tableau), 1.0], rates).ravel()
 
@@ -71,7 +75,7 @@ def implicit_kernel(
         """e^{γτ} at the stages and the end of steps, and their reciprocals."""
         return np.exp(np.concatenate([h[:, None] * exponents, -h[:, None] * exponents], axis=1))
 
-    return OneStepKernel(code, single, growths)
+    return OneStepKernel(code, single, symbols.values, growths)
 
 
 def newton_code(lettered: Lettered, tableau: Tableau, compensated: bool, damped: bool) -> NewtonCode:

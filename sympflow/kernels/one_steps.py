@@ -13,7 +13,7 @@ from sympflow.compiler import NotCompiled
 from sympflow.compiler.control import Code, Value
 from sympflow.hamiltonian.formulas import MOST_COMPILED, TracedHamiltonian, TracedLetters
 from sympflow.kernels.protocol import Kernel, Run, Steps, Task, run_states
-from sympflow.kernels.rollouts import Columns, Rollouts
+from sympflow.kernels.rollouts import Columns, Rollouts, shared
 from sympflow.kernels.runs import Numbers, step_function
 from sympflow.kernels.threads import given
 
@@ -21,7 +21,17 @@ if TYPE_CHECKING:
     from sympflow.kernels.reverse import Recorded
     from sympflow.kernels.terms import Terms
 
-__all__ = ["Lettered", "OneStep", "OneStepKernel", "check_size", "is_large", "lettered", "parametric", "terms_of"]
+__all__ = [
+    "Lettered",
+    "OneStep",
+    "OneStepKernel",
+    "check_size",
+    "is_large",
+    "lettered",
+    "parametric",
+    "shared_code",
+    "terms_of",
+]
 
 
 Lettered = Any
@@ -44,7 +54,7 @@ def is_large(form: Any) -> bool:
         return False
     from sympflow.kernels.terms import is_large
 
-    return is_large(form)
+    return is_large(form.structure)
 
 
 def parametric(form: Any, names: tuple[str, ...]) -> Any:
@@ -54,6 +64,13 @@ def parametric(form: Any, names: tuple[str, ...]) -> Any:
     if names:
         return form.named(names)
     return form if is_large(form) else form.parametric
+
+
+def shared_code(form: Any, key: Any, make: Callable[[], Any]) -> Any:
+    """The code of a form, the same for all values of its parameters."""
+    if not form.parameters or form.time is not None:
+        return make()
+    return shared((form.H, form.parameters, form.q, form.p, key), make)
 
 
 def terms_of(lettered: Lettered) -> Terms:
@@ -132,25 +149,28 @@ class OneStep(Rollouts):
 class OneStepKernel(Kernel):
     """Compiled loops of a method of one stage a step: the code of runs, and that of single steps.
 
-    ``more(h)`` (n, k) are numbers that a method adds to steps h (n,); trajectories may have `own` parameters (N, m).
+    Parameters have `values` (m,), or each trajectory has `own` ones (N, m); ``more(h)`` (n, k) are numbers that a
+    method adds to steps h (n,).
     """
 
     def __init__(
         self,
         code: OneStep,
         single: OneStep,
+        values: Sequence[float],
         more: Callable[[np.ndarray], np.ndarray] | None = None,
         own: np.ndarray | None = None,
     ) -> None:
-        self._code, self._single, self._more, self._own = code, single, more, own
+        self._code, self._single, self._values, self._more, self._own = code, single, values, more, own
 
     def varied(self, values: np.ndarray) -> OneStepKernel:
         """The loops of batches whose trajectories have these values (m, N)."""
-        return OneStepKernel(self._code, self._single, self._more, np.ascontiguousarray(values.T, dtype=np.float64))
+        own = np.ascontiguousarray(values.T, dtype=np.float64)
+        return OneStepKernel(self._code, self._single, self._values, self._more, own)
 
     def _numbers(self, h: np.ndarray, t: np.ndarray) -> np.ndarray:
         """The numbers (n, size) of steps of lengths h (n,), at the times t (n,) less those of whole steps before."""
-        values = np.array([self._code.lettered.symbols.values]) if self._own is None else self._own
+        values = np.array([self._values]) if self._own is None else self._own
         numbers = [h[:, None], values[np.arange(len(h)) % len(values)]]
         if self._code.driven:
             numbers.append(t[:, None])

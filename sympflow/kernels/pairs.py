@@ -10,8 +10,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import sympy as sp
@@ -122,17 +124,11 @@ def with_parts(total: Any, parts: Sequence[tuple[Any, Sequence[Any]]], axis: int
 class FewSymbols:
     """A few bodies in the place of a symbolic Hamiltonian, whose parameters are all that a pair depends on."""
 
-    T = None
-    samples: ClassVar[Mapping[str, Any]] = {}
+    H = T = None
+    samples: Mapping[str, Any] = MappingProxyType({})
 
     def __init__(self, local: PairsHamiltonian) -> None:
-        named = {c.name: value for c, value in zip(local.c, local.constants, strict=True)}
-        named["softening"] = local.softening**2
-        for k, side in enumerate(() if local.box is None else local.box.tolist()):
-            named |= {f"box_{k}": side, f"over_box_{k}": 1 / side}
-        named |= {f"w_{i}": 1 / mass for i, mass in enumerate(local.masses.tolist())}
-        for i, column in enumerate(local.columns):
-            named |= {f"column_{i}_{k}": x for k, x in enumerate(column.tolist())}
+        named = local.letters({})
         self.local, self.ndof = local, local.ndof
         self.values, self.parameters = tuple(named.values()), tuple(map(sp.Symbol, named))
         self.q, self.p = (tuple(sp.Symbol(f"{x}{i + 1}") for i in range(self.ndof)) for x in "qp")
@@ -158,9 +154,11 @@ def few(local: PairsHamiltonian) -> tuple[Callable[..., Splitting] | None, tuple
     return partial(FewSplitting, symbols), symbols.values
 
 
+@dataclass(frozen=True)
 class FewSplitting(Splitting):
     """The kicks and drifts of a few bodies."""
 
+    symbols: FewSymbols
     polynomial = False
 
     @property
@@ -182,6 +180,7 @@ class FewShape(Shape):
 
     @property
     def _local(self) -> PairsHamiltonian:
+        assert isinstance(self.symbols, FewSymbols)
         return self.symbols.local
 
     def _kicked(self) -> list[Any]:

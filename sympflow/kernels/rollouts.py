@@ -12,12 +12,12 @@ import numpy as np
 
 from sympflow.compiler import NotCompiled
 from sympflow.compiler.control import Value
-from sympflow.compiler.machine import address
+from sympflow.compiler.machine import address, given
 from sympflow.kernels.protocol import Batch
 from sympflow.kernels.runs import BLOCK, Memory, Numbers, Room, Values, map_function, reverse_function, run_function
 from sympflow.kernels.threads import NEVER
 
-__all__ = ["Columns", "Rollouts", "SplittingRollouts", "aligned", "filled", "zeros"]
+__all__ = ["Columns", "Rollouts", "SplittingRollouts", "aligned", "filled", "shared", "zeros"]
 
 LINE = 8  # numbers in a line of memory
 START, ONE = np.zeros(1, dtype=np.int64), np.ones(1, dtype=np.int64)
@@ -49,6 +49,20 @@ def filled(x: np.ndarray, lanes: int, times: int = 1) -> np.ndarray:
     each = x.reshape(*x.shape[:-1], times, n)
     more = np.repeat(each[..., -1:], lanes - n, axis=-1)
     return np.concatenate([each, more], axis=-1).reshape(*x.shape[:-1], times * lanes)
+
+
+MOST_CODES = 64  # that are kept, of systems with other structures
+_CODES: dict[Any, Any] = {}
+
+
+def shared(key: Any, make: Callable[[], Any]) -> Any:
+    """Return the code of a key, made once while it is kept: systems are often made again."""
+    found = _CODES.get(key)
+    if found is None:
+        while len(_CODES) >= MOST_CODES:
+            _CODES.pop(next(iter(_CODES)), None)
+        found = _CODES[key] = make()
+    return found
 
 
 class Rollouts(ABC):
@@ -180,7 +194,7 @@ class Rollouts(ABC):
         if self.room is not None:
             work = aligned((3 * self.n_values + self.room) * width)
             arguments = *arguments, self.n_values, self.n_out if n_out is None else n_out, work, self._places
-        self.function(name, width)(*[address(x) if isinstance(x, np.ndarray) else x for x in arguments])
+        self.function(name, width)(*given(arguments))
 
     def run(self, table: Any, batch: Batch, closed: bool = True) -> None:
         """Run the rows of a batch in the lanes of registers; those that end early once more, alone, to find where."""

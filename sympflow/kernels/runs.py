@@ -9,10 +9,11 @@ closing column is applied. One function is the run of a single trajectory, and o
 from __future__ import annotations
 
 import ctypes
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 from sympflow.compiler.control import BOOL, INT, POINTER, Code, Module, Rows, Type, Value, Variable
 from sympflow.compiler.machine import compiled, host
@@ -328,11 +329,12 @@ def step_function(
     table, n_columns, n_powers, x, h, t, rows, n_rows, out = code.arguments[:9]
     state = memory(code, width, code.arguments[9:], False) if memory else _Registers(code, n_values, n_out, width)
     alone, behind = Lanes(code, 1, width), Lanes(code, own, width) if own else None
+    place = code.arguments[10] if memory else code.constant(n_out, INT)
     with code.over(groups(code, n_rows, width)) as group:
         begin = group * width
         at, length, time = (alone.loaded(given, begin, n_rows)[0] for given in (x, h, t))
         state.open(rows, begin, n_rows, n_out, own)
-        values = [] if behind is None else behind.loaded(rows, begin, n_rows, state.n_out + own, state.n_out)
+        values = [] if behind is None else behind.loaded(rows, begin, n_rows, place + own, place)
         with code.over(n_columns) as j:
             given = []
             for r in range(len(powers)):
@@ -399,19 +401,60 @@ class _History:
         return [self.code.load(start, i * self._width, type) for i in range(self._n)]
 
 
-class Memory:
-    """The state, its end, and the state before a block of steps, in memory.
+_Place = TypeVar("_Place", Room, Rows)
+_Count = TypeVar("_Count", Value, int)
 
-    A subclass may order numbers in another way than rows do: see `open`, `store` and `keep`. Numbers are copied
-    `at_once`; `chunks` groups of trajectories run in turn.
-    """
+
+class _States(ABC, Generic[_Place, _Count]):
+    """The state, its end, and the state before a block of steps. Numbers are copied `at_once`, and `chunks` groups of
+    trajectories run in turn."""
 
     at_once = chunks = 1
-    n_values: Any
-    n_out: Any
-    _running: Any
-    _end: Any
-    _before: Any
+    code: Code
+    width: int
+    n_values: _Count
+    n_out: _Count
+    _running: _Place
+    _end: _Place
+    _before: _Place
+    _remembers: bool
+
+    def block(self, every: int) -> Value:
+        return self.code.constant(every, INT)
+
+    @abstractmethod
+    def _copy(self, source: _Place, target: _Place) -> None: ...
+
+    @abstractmethod
+    def _revive(self) -> None: ...
+
+    @abstractmethod
+    def _write(
+        self, room: _Place, n: _Count, out: Value, begin: Value, n_rows: Value, stride: Value, at: Value
+    ) -> None:
+        """Write n numbers of the states at a place into rows."""
+
+    def remember(self) -> None:
+        if self._remembers:
+            self._copy(self._running, self._before)
+
+    def restore(self) -> None:
+        self._copy(self._before, self._running)
+        self._revive()
+
+    def end(self) -> None:
+        self._copy(self._running, self._end)
+
+    def store(self, out: Value, begin: Value, n_rows: Value, stride: Value, at: Value) -> None:
+        self._write(self._end, self.n_out, out, begin, n_rows, stride, at)
+
+    def keep(self, running: Value, begin: Value, n_rows: Value) -> None:
+        one, zero = self.code.constant(1, INT), self.code.constant(0, INT)
+        self._write(self._running, self.n_values, running, begin, n_rows, one, zero)
+
+
+class Memory(_States[Room, Value]):
+    """States in memory. A subclass may order numbers in another way than rows do: see `open`, `store` and `keep`."""
 
     def __init__(self, code: Code, width: int, arguments: Sequence[Value], before: bool) -> None:
         self.code, self.width, self._remembers = code, width, before
@@ -420,9 +463,6 @@ class Memory:
         places = [code.at(work, self.n_values * (i * width)) for i in range(4)]
         self.rooms = [Room(code, width, x, places[3], self.n_values, data) for x in places[:3]]
         self._running, self._end, self._before = self.rooms
-
-    def block(self, every: int) -> Value:
-        return self.code.constant(every, INT)
 
     def open(self, rows: Value, begin: Value, n_rows: Value, given: int | None = None, own: int = 0) -> None:
         n = self.n_values if given is None else self.n_out
@@ -446,19 +486,8 @@ class Memory:
     def look(self, look: Callable[[Any], Any]) -> None:
         look(self._running)
 
-    def remember(self) -> None:
-        if self._remembers:
-            self._copy(self._running, self._before)
-
-    def restore(self) -> None:
-        self._copy(self._before, self._running)
-        self._revive()
-
     def _revive(self) -> None:
         self._alive.value = self.code.constant(1, Type("i1", self.width))
-
-    def end(self) -> None:
-        self._copy(self._running, self._end)
 
     @contextmanager
     def _blocks(self) -> Iterator[tuple[Value, Type]]:
@@ -467,7 +496,7 @@ class Memory:
         with self.code.over(self.code.op("udiv", INT, self.n_values, self.code.constant(self.at_once, INT))) as i:
             yield i * size, Type("double", size)
 
-    def _copy(self, source: Any, target: Any) -> None:
+    def _copy(self, source: Room, target: Room) -> None:
         with self._blocks() as (i, type):
             self.code.store(self.code.load(source.state, i, type), target.state, i)
 
@@ -480,14 +509,7 @@ class Memory:
         self._alive.value = self._alive.value & (good if self.at_once == 1 else ~self.code.any(~good))
         return self.code.any(self._alive.value)
 
-    def store(self, out: Value, begin: Value, n_rows: Value, stride: Value, at: Value) -> None:
-        self._write(self._end, self.n_out, out, begin, n_rows, stride, at)
-
-    def keep(self, running: Value, begin: Value, n_rows: Value) -> None:
-        one, zero = self.code.constant(1, INT), self.code.constant(0, INT)
-        self._write(self._running, self.n_values, running, begin, n_rows, one, zero)
-
-    def _write(self, room: Any, n: Any, out: Value, begin: Value, n_rows: Value, stride: Value, at: Value) -> None:
+    def _write(self, room: Room, n: Value, out: Value, begin: Value, n_rows: Value, stride: Value, at: Value) -> None:
         with self.code.over(there(self.code, self.width, begin, n_rows)) as k:
             source, start = self.code.at(room.state, k), self.code.at(out, ((begin + k) * stride + at) * n)
             with self.code.over(n) as i:
@@ -497,7 +519,7 @@ class Memory:
         _mark(self.code, self._alive.value, n, finite, begin, n_rows)
 
 
-class _Registers(Memory):
+class _Registers(_States[Rows, int]):
     """States that pass through registers in each stage: a chunk of lanes, which stays there, or many in memory.
 
     A chunk need not wait for the one before, whose chain of operations goes on meanwhile.
@@ -567,7 +589,7 @@ class _Registers(Memory):
         with self._each() as c:
             self._watch[c] = 0.0
 
-    def _copy(self, source: Any, target: Any) -> None:
+    def _copy(self, source: Rows, target: Rows) -> None:
         with self._each() as c:
             self._put(target, c, self._values(source, c))
 
@@ -583,7 +605,7 @@ class _Registers(Memory):
             alive.value = alive.value | code.any(code.apply("eq", (total, 0.0)))
         return alive.value
 
-    def _write(self, room: Any, n: Any, out: Value, begin: Value, n_rows: Value, stride: Value, at: Value) -> None:
+    def _write(self, room: Rows, n: int, out: Value, begin: Value, n_rows: Value, stride: Value, at: Value) -> None:
         with self._each() as c:
             self._lanes.store(self._values(room, c)[:n], out, begin + c * self.width, n_rows, stride, at)
 

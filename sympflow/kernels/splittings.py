@@ -5,11 +5,11 @@ A kick is p − b∇V + g∇²V v − c∇(½ v·∇²V v) with v = M⁻¹∇V, 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -29,12 +29,36 @@ if TYPE_CHECKING:
     from sympflow.kernels.approximations import OnInterval, Ranges
     from sympflow.kernels.stage_times import Driving
 
-__all__ = ["Shape", "Splitting", "SplittingCode", "WithinRange", "shared"]
+__all__ = ["Shape", "Splitting", "SplittingCode", "WithinRange"]
 
 MOST_TABLES = 64  # that are kept
 LONG = 64  # operations of a stage, beyond which products of sums may better be left
 CLOCK = 3  # numbers of the time in a column
 EARLY = -4  # when momenta are known before the positions, in cycles
+
+
+class Formulas(Protocol):
+    """V and T with their letters: a SymbolicHamiltonian, a TracedHamiltonian, or `FewSymbols` of a few bodies."""
+
+    ndof: int
+    samples: Mapping[str, Any]
+
+    @property
+    def H(self) -> Any: ...
+    @property
+    def V(self) -> Any: ...
+    @property
+    def T(self) -> Any: ...
+    @property
+    def q(self) -> tuple[Any, ...]: ...
+    @property
+    def p(self) -> tuple[Any, ...]: ...
+    @property
+    def parameters(self) -> tuple[Any, ...]: ...
+    @property
+    def values(self) -> tuple[float, ...]: ...
+    @property
+    def inverse_mass(self) -> Any: ...
 
 
 @dataclass(frozen=True)
@@ -46,7 +70,7 @@ class Splitting:
     table.
     """
 
-    symbols: Any  # a SymbolicHamiltonian, a TracedHamiltonian, or what is like these
+    symbols: Formulas
     level: int
     monomials: Monomials = ()
     compensated: bool = False
@@ -345,20 +369,6 @@ def _kick_changes(
             monomial = monomial * x**n
         changes = [x - e * y for x, y in zip(changes, gradient(monomial, q), strict=True)]
     return changes
-
-
-MOST_CODES = 64  # that are kept, of systems with other structures
-_CODES: dict[Any, Any] = {}
-
-
-def shared(key: Any, make: Callable[[], Any]) -> Any:
-    """Return the code of a key, made once while it is kept: systems are often made again."""
-    found = _CODES.get(key)
-    if found is None:
-        while len(_CODES) >= MOST_CODES:
-            _CODES.pop(next(iter(_CODES)), None)
-        found = _CODES[key] = make()
-    return found
 
 
 class SplittingCode(SplittingRollouts):

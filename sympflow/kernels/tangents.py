@@ -22,10 +22,10 @@ from sympflow.hamiltonian.formulas import evaluator
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.protocol import Batch, RunCheckpoint, Task, run_states
-from sympflow.kernels.rollouts import Rollouts
+from sympflow.kernels.rollouts import Rollouts, shared
 from sympflow.kernels.runs import Room
 from sympflow.kernels.splitting_loops import splitting_loops
-from sympflow.kernels.splittings import Shape, Splitting, SplittingCode, shared
+from sympflow.kernels.splittings import Shape, Splitting, SplittingCode
 from sympflow.kernels.stages import StageTable, run_table
 from sympflow.kernels.threads import given
 from sympflow.lazy import kept

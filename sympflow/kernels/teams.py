@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sympflow.compiler.control import INT, Code, Type, Value
-from sympflow.compiler.machine import address
+from sympflow.compiler.machine import address, given
 from sympflow.kernels.rollouts import Columns, SplittingRollouts
 from sympflow.kernels.runs import BLOCK, Memory, Room
 from sympflow.kernels.stages import evaluated
@@ -151,12 +151,12 @@ class SharedRollouts(SplittingRollouts):
             arguments = *arguments[:-1], stop
         threads = threads_for(self.pieces, n_columns * self.work, None) if n_rows == 1 and os.name == "posix" else 1
         function, meeting = self.function(name, width), np.zeros(16, dtype=np.int64)
-        given = [address(x) if isinstance(x, np.ndarray) else x for x in arguments]
+        shared = given(arguments)
         members = self.members(meeting, stop, threads, max(1, min(BLOCK, MOMENT // max(1, self.work))))
 
         def run(k: int) -> None:
             own = members(k)
-            function(*given, len(own.room) // 3, self.n_out, address(own.room), address(own.context))
+            function(*shared, len(own.room) // 3, self.n_out, address(own.room), address(own.context))
 
         together(threads, run, stop)
 

@@ -379,7 +379,7 @@ def driven(
 ) -> tuple[float, list[float]]:
     """The share of squares that drives leave, and their ω; of other trajectories than those that they were fitted to.
 
-    One trajectory cannot tell a drive from its own motion: infinite.
+    From one trajectory a drive cannot be distinguished from its own motion: infinite.
     """
     first, v, near = smooth.owner % 2 == 0, smooth.slopes, 0.5 * np.pi / smooth.longest
 

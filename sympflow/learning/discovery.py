@@ -187,7 +187,7 @@ class Discovery:
     expected_noise : ndarray of shape (2d,)
         The noise as it was given, or seen in the data without a model; 0 where they cannot tell.
     explains : bool
-        False if the model leaves more than noise, or the data do not tell it from others: see `unseen`.
+        False if the model leaves more than noise, or the data do not distinguish it from others: see `unseen`.
     remark : str
         What the data say where no model explains them or many do, or where the noise that was given is too large.
     path : tuple of Model

@@ -258,7 +258,7 @@ class Family:
     observed: str = "both"  # What its numbers can be told by: "qp" for states, "qv" for velocities, "both"
 
     def tells(self, constraints: Constraints) -> bool:
-        """True if what is observed can tell the numbers of its models."""
+        """True if the observed quantities determine the numbers of its models."""
         return self.observed in ("both", "qv" if constraints.velocities else "qp")
 
 

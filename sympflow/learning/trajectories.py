@@ -18,7 +18,7 @@ from sympflow.flow.scaling import Scaling
 from sympflow.learning import reading
 from sympflow.learning.reading import OBSERVED, Run
 from sympflow.learning.smoothing import Smooth, smoothed
-from sympflow.show.cards import Card, Shown
+from sympflow.show.cards import Answering, Card
 from sympflow.show.pictures import MOST_LINES, trajectory_figure
 from sympflow.show.style import saved
 from sympflow.storage.layout import imported
@@ -40,7 +40,7 @@ ANGLES = {"2*np.pi": 2 * np.pi, "360": 360.0}  # periods of angles that are look
 
 
 @dataclass(frozen=True, repr=False)
-class Trajectories(Shown):
+class Trajectories(Answering):
     """Trajectories of one system, from which it is learned; made by `Trajectories.read`.
 
     Attributes
@@ -96,7 +96,7 @@ class Trajectories(Shown):
             NaN marks a value that is missing. Points without any value are left out. A trajectory whose times all
             descend is turned around.
         ndof : int, optional
-            Degrees of freedom d; else read off the data. With it a table's columns may bear any names, in this `order`.
+            Degrees of freedom d; else read off the data. With it a table's columns may have any names, in this `order`.
         order : {"halves", "pairs"} or sequence of int
             The order of the rows of y, or of columns whose names are not those of coordinates: q1 … qd, p1 … pd; q1,
             p1, q2, p2, …; or the places of q1 … qd, p1 … pd.

@@ -59,9 +59,9 @@ SAMPLED = 32  # states at which vector fields are compared
 
 
 def check_problem(reference: object, system: HamiltonianSystem, t0: float, y0: np.ndarray) -> None:
-    """Raise a ValueError if a reference is none of this problem: another system, another y0, another energy.
+    """Raise a ValueError if a reference belongs to another problem: another system, another y0, another energy.
 
-    A Solution tells its system, whose vector field is compared along it, and its y0. Of states alone the energy is all
+    A Solution has its system, whose vector field is compared along it, and its y0. Of states alone the energy is all
     that can be looked at, where it is kept.
     """
     if isinstance(reference, Solution):

@@ -23,8 +23,8 @@ from sympflow.integrators.contract import FINISHED
 from sympflow.integrators.diagnosis import try_steps
 from sympflow.integrators.grid import Grid
 from sympflow.integrators.impulses import landings
+from sympflow.integrators.loops import compiled_loops
 from sympflow.integrators.registry import naming_plugin
-from sympflow.integrators.steppers import compiled_loops
 from sympflow.metrics.orbits import OfOrbits, Orbits, checked_orbits, of_many
 from sympflow.show.cards import Card
 from sympflow.show.pictures import curves_figure
@@ -102,7 +102,7 @@ def lyapunov(
 
     As t grows it tends to the exponent of the orbit, for almost all initial vectors [1]_ [2]_: to a positive number on
     a chaotic one, and like ln(t)/t to 0 on a regular one, so that a value of that size at the end of the run does not
-    tell the two apart (`sali` does). With friction the exponent of an orbit that comes to rest is negative.
+    distinguish the two (`sali` does). With friction the exponent of an orbit that comes to rest is negative.
 
     Parameters
     ----------
@@ -256,13 +256,13 @@ def gali(
     check_counts(k=k)
     if not 2 <= k <= 2 * system.ndof:
         raise ValueError(
-            f"`k` must be from 2 to {2 * system.ndof}, the dimension of the phase space of {system.called}; got {k}."
+            f"`k` must be from 2 to {2 * system.ndof}, the dimension of the phase space of {system.name!r}; got {k}."
         )
     return indicator(orbits, int(k), VOLUME, checked_threshold(below), t_eval, deviations, seed, backend)
 
 
 def checked_threshold(below: float) -> float:
-    """`below` as a float; a ValueError if it is no threshold."""
+    """`below` as a float; a ValueError unless it is a threshold."""
     value = as_float(below)
     if not 0 <= value < 1:
         raise ValueError(f"`below` must be a number from 0, to go on to the end, up to 1; got {below!r}.")
@@ -318,7 +318,7 @@ def indicator(
     scale = weights(system)
     w0 = _deviations(deviations, vectors, scale, seed)
     length = integrator.step_length(system) if integrator.on_grid else None
-    told, jumps = landings(integrator, system, t0, t1, backend != "compiled")
+    told, jumps = landings(integrator, system, t0, t1, backend != "compiled", kinks=False)
     if told:
         warn(told, RuntimeWarning)
     if length is not None:

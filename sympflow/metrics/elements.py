@@ -139,7 +139,7 @@ def _bodies(solution: Any, system: HamiltonianSystem | None) -> tuple[np.ndarray
     local = system.local
     if not isinstance(local, PairsHamiltonian):
         raise ValueError(
-            f"`system` {system.called} has no bodies, whose momenta are added up: it must be one of "
+            f"`system` {system.name!r} has no bodies, whose momenta are added up: it must be one of "
             "HamiltonianSystem.pairs or planets."
         )
     shape = (*y.shape[:-1], local.n_bodies, local.dim)
@@ -166,7 +166,7 @@ def _frame(system: HamiltonianSystem) -> Frame:
     frame = frame_of(system)
     if frame is None:
         raise ValueError(
-            f"`system` {system.called} has no planets about a star, whose elements these are: make it by "
+            f"`system` {system.name!r} has no planets about a star, whose elements these are: make it by "
             "HamiltonianSystem.planets."
         )
     return frame

@@ -160,7 +160,7 @@ class EnergyGrowth:
         a systematic error in each step gives 1, a truncation error above the rounding 0.
     drift, drift_error : float
         Slope of the energy error per step, the mean over the trajectories, and its standard error from the scatter
-        between them; the error is inf for a single trajectory, whose random walk cannot be told from a drift.
+        between them; the error is inf for a single trajectory, whose random walk cannot be distinguished from a drift.
     """
 
     steps: np.ndarray = field(repr=False)

@@ -60,7 +60,7 @@ def energy_balance_error(sol: Solution, relative: bool = False) -> np.ndarray:
     sol.system.check_impulses("at which its energy jumps", "use sympflow.reference_error(sol)")
     if not kept_by(sol.system):
         raise ValueError(
-            f"`sol` is of {sol.system.name!r}, of which H jumps at some times, where ∂H/∂t is not finite: use "
+            f"`sol` is of {sol.system.name!r}, whose H jumps at some times, where ∂H/∂t is not finite: use "
             "sympflow.reference_error(sol), sympflow.symplecticity_defect(sol)."
         )
     if sol.varied:

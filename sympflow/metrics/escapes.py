@@ -121,11 +121,11 @@ def escape_times(
 
 
 def region_of(outside: Any, system: HamiltonianSystem) -> Outside:
-    """The function of states that `outside` means; a ValueError or TypeError if it is none."""
+    """The function of states that `outside` means; a ValueError or TypeError if it means none."""
     if outside is None:
         if system.domain is None:
             raise ValueError(
-                f"`outside` is needed, as {system.called} has no domain: pass a radius, a domain or a function."
+                f"`outside` is needed, as {system.name!r} has no domain: pass a radius, a domain or a function."
             )
         outside = system.domain
     if real_number(outside):

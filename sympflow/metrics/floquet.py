@@ -45,7 +45,7 @@ class FloquetMultipliers:
     multipliers : ndarray (2d,), complex
         The largest magnitudes first.
     monodromy : ndarray (2d, 2d)
-        M, of which they are the eigenvalues.
+        M, whose eigenvalues they are.
     period : float
     mismatch : float
         |y(t0 + T) − y0|: 0 of an orbit that is periodic.
@@ -121,7 +121,7 @@ def floquet_multipliers(
     system = given_system(system)
     T = system.period if period is None else period
     if T is None:
-        raise ValueError(f"`period` is needed: the system {system.called} has none of its own.")
+        raise ValueError(f"`period` is needed: the system {system.name!r} has none of its own.")
     check_positive("period", T)
     checked_number("t0", t0)
     check_array(y0, "multipliers are of NumPy arrays")
@@ -150,8 +150,8 @@ def floquet_multipliers(
     sizes = [float(np.abs(scale * y).max()) for y in (start, system.y0) if y is not None]
     if not np.linalg.norm(scale * (to_numpy(end) - start)) <= CLOSED * (max(sizes) or 1.0):
         warn(
-            f"The orbit is not periodic: after {T:g} it is {mismatch:.3g} from `y0`. Take a state of a periodic orbit, "
-            "its period, or a smaller `dt`.",
+            f"The orbit is not periodic: after {T:g} it is {mismatch:.3g} from `y0`. Start from a state of a periodic "
+            "orbit, its period, or a smaller `dt`.",
             RuntimeWarning,
         )
     M = np.eye(len(start))

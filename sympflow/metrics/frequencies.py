@@ -149,7 +149,7 @@ def frequencies(
         sol = solve(orbits.system, orbits.integrator, span, some, **run)
         if signal is None and (growing := _growing(sol.y[:, : system.ndof], times)):
             warn(
-                f"`signal`: {growing} grows with the time, as an angle that turns over, and its strongest lines are "
+                f"`signal`: {growing} grows with time, as an angle that turns over, and its strongest lines are "
                 "those of a ramp. Pass the sine and cosine of the angle, signal=lambda y: np.exp(1j * y[..., :1, :]).",
                 RuntimeWarning,
             )

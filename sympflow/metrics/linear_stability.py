@@ -57,7 +57,7 @@ class Window(NamedTuple):
 
 @dataclass(frozen=True)
 class LinearStability:
-    """The steps, or the z = hω, at which a method keeps small oscillations bounded.
+    """The steps, or the z = hω, for which a method keeps small oscillations bounded.
 
     Attributes
     ----------
@@ -361,7 +361,7 @@ def _quadratic(system: HamiltonianSystem, y0: np.ndarray) -> bool:
 def of_method(
     integrator: Integrator, system: HamiltonianSystem, small: SmallOscillations, longest: float
 ) -> LinearStability | None:
-    """Return the steps, up to `longest`, at which a method keeps small oscillations of a system bounded.
+    """Return the steps, up to `longest`, that keep small oscillations of a system bounded.
 
     Exact for kicks and drifts; for another method with steps on a grid its step at the equilibrium is differentiated,
     at 2048 steps, and windows narrower than their distance may be missed. None where neither can be.

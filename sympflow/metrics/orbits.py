@@ -16,7 +16,7 @@ from sympflow.integrators.choosing import integrator_for, with_start
 from sympflow.integrators.contract import Integrator
 from sympflow.integrators.problems import check_y0
 from sympflow.integrators.registry import check_applies
-from sympflow.show.cards import Card, Shown, numbers
+from sympflow.show.cards import Answering, Card, numbers
 from sympflow.show.pictures import histogram_figure
 from sympflow.show.style import saved
 from sympflow.systems.given import GivenSystem, given_system
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-class OfOrbits(Shown):
+class OfOrbits(Answering):
     """Results of orbits, with a `status`, negative for orbits that failed, a `message`, and a figure."""
 
     caption: ClassVar[str]

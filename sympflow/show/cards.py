@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 import io
+import re
 import sys
 import unicodedata
 from abc import ABC, abstractmethod
@@ -13,6 +14,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
+
+from sympflow.arguments import told_of_all
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -44,7 +47,7 @@ class Card:
         rows = "".join(
             f"<tr>{cell}<b>{html.escape(label)}</b></td>{cell}{html.escape(cut(value))}</td></tr>"
             for label, value in self.facts.items()
-            if value
+            if value and not (self.formula and label == "H")
         )
         parts = [
             f"<b>{html.escape(self.caption)}</b>" if self.caption else "",
@@ -82,10 +85,14 @@ class Shown(ABC):
 
 
 class Answering(Shown):
-    """An object that says where it has what users look for under other names."""
+    """An object that says where it has what users look for under other names, and how its methods are called."""
 
     _OTHER_NAMES: ClassVar[Mapping[str, str]] = {}
     """These names, and what to take."""
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        told_of_all(cls)
 
     if not TYPE_CHECKING:
 
@@ -131,6 +138,11 @@ def cut(text: str, longest: int = LONGEST) -> str:
     """A text in one line, cut at its end."""
     line = " ".join(text.split())
     return line if len(line) <= longest else f"{line[: longest - 2]} …"
+
+
+def brief(text: str) -> str:
+    """A text whose numbers have six digits at most."""
+    return re.sub(r"\d+\.\d{6,}(e[-+]?\d+)?", lambda found: f"{float(found[0]):.6g}", text)
 
 
 def numbers(values: Any, most: int = 8) -> str:

@@ -35,7 +35,7 @@ GLOBALS, ATTRIBUTES = ("LOAD_GLOBAL", "LOAD_NAME"), ("LOAD_ATTR", "LOAD_METHOD",
 
 @runtime_checkable
 class Identified(Protocol):
-    """An object that tells what it is made of, where that is less than its state."""
+    """An object that states what it is made of, where that is less than its state."""
 
     def identity_parts(self) -> Any:
         """Return what it is made of."""

@@ -197,7 +197,7 @@ class Store:
             raise ValueError(f"`store` {str(place)!r} is not a store of sympflow: give another place.") from error
 
     def check_same(self, key: str, mine: Known, asked: str, kind: str, remedy: str, same: bool) -> None:
-        """Check that a store is of the call that asks for it."""
+        """Check that a store belongs to the call that opens it."""
         try:
             theirs = json.loads(self.attributes[key])
         except (KeyError, TypeError, ValueError):
@@ -218,7 +218,7 @@ class Store:
             )
 
     def check_made_of(self, fields: Mapping[str, Field]) -> None:
-        """Check that the arrays are those of the call that opens the store."""
+        """Check that the arrays belong to the call that opens the store."""
         alike = attrgetter("dims", "shape", "dtype", "chunks")
         for name in {**fields, **self.fields}:
             if name in self.fields and not (name in fields and alike(fields[name]) == alike(self.fields[name])):

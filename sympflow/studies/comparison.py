@@ -84,7 +84,7 @@ def compare(
         Number of instants: one in each of so many equal parts of the interval, at places that meet all phases of an
         oscillation, the last at the end.
     repeats : int
-        Runs that are timed, interleaved over the methods, after one that is not. What compiles them is told apart, as
+        Runs that are timed, interleaved over the methods, after one that is not. Compilation is measured apart, as
         `compile_time`.
     match : "time", "evaluations" or "energy_error", optional
         Tune the steps and tolerances of the methods after the first until they equal it in this.
@@ -105,7 +105,7 @@ def compare(
 
     Notes
     -----
-    The run time is that of `solve`, with everything that the outputs need.
+    The run time is the time of `solve`, with everything that the outputs need.
 
     Examples
     --------
@@ -168,7 +168,7 @@ def default_metrics(system: HamiltonianSystem) -> tuple[str, ...]:
         what = "energy" if system.shows_energy else kept_by(system).replace("energy", "")
         kept = {"energy": ("energy", "drift"), "balance": ("balance",)}.get(what, ())
         return ("error", *kept, "volume", "symplecticity")
-    shrinks_evenly = system.external_force is None and system.friction and system.friction.isotropic
+    shrinks_evenly = system.external_force is None and system.friction.isotropic
     return ("error", "conformal") if shrinks_evenly else ("error",)
 
 

@@ -61,8 +61,8 @@ def poincare_section(
     y0 : array_like of shape (..., 2d), optional
         One state, or a batch of them. With fixed steps the trajectories advance together. The default is the system's.
     coordinate : int or str, optional
-        Index into [q, p], or a name such as "q1" or "p2"; by default the first. Naming one for a driven system asks for
-        its crossings of a plane, at whatever times.
+        Index into [q, p], or a name such as "q1" or "p2"; by default the first. For a driven system it chooses the
+        crossings of a plane, instead of one point each period.
     level : float, optional
         By default 0.
     direction : 1, -1 or 0, optional

@@ -85,7 +85,7 @@ def work_precision(
         Timed runs of each point, interleaved over all points of one batch size.
     budget : float
         Seconds that the repeats of one point may take; where one run takes longer, it is not repeated. All that a
-        method runs is compiled before, which `compile_time` tells.
+        method runs is compiled before, in `compile_time`.
     backend, progress
         As for `compare`.
 

@@ -9,7 +9,7 @@ import math
 import os
 import unicodedata
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -17,16 +17,24 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from sympflow.arguments import naming_path, writable
-from sympflow.show.cards import Card, Shown
+from sympflow.show.cards import Answering, Card
+from sympflow.storage.layout import imported
 
 if TYPE_CHECKING:
+    import pandas
     from matplotlib.figure import Figure
 
     from sympflow.hamiltonian.system import HamiltonianSystem
 
 
-class Report(Shown):
+class Report(Answering):
     """The result of a study. A subclass gives its rows, settings, table and figure."""
+
+    _OTHER_NAMES: ClassVar[Mapping[str, str]] = {
+        **dict.fromkeys(("data", "results", "records"), "`rows`, or `to_dataframe()`"),
+        **dict.fromkeys(("save", "to_text", "summary"), "`table()`, `to_csv(path)` or `to_json(path)`"),
+        **dict.fromkeys(("to_pandas", "df"), "`to_dataframe()`"),
+    }
 
     columns: ClassVar[tuple[str, ...]]  # the fields of the rows that files hold, in this order
 
@@ -53,6 +61,13 @@ class Report(Shown):
 
     def preview(self) -> Figure | None:
         return self.figure()
+
+    def __getitem__(self, key: Any) -> Any:
+        raise TypeError(f"{type(self).__name__} has no item {key!r}: take `rows`, as in report.rows[0].")
+
+    def to_dataframe(self) -> pandas.DataFrame:
+        """The rows as a `pandas.DataFrame`; an ImportError if pandas is not installed."""
+        return imported("pandas", "to_dataframe()").DataFrame(records(self.rows, self.columns))
 
     def to_csv(self, path: str | os.PathLike[str]) -> Path:
         """Write the rows to a CSV file, every figure to full precision."""

@@ -645,7 +645,7 @@ class StepLimit:
         ω of the fastest small oscillation about the equilibrium, or, where none is found, the largest along the orbit.
     linear : float or None
         The step at which oscillations of these frequencies are first lost; None if they never are, or it is not known.
-        The orbits of the study may bear longer steps, or only shorter ones.
+        The orbits of the study may stay bounded with longer steps, or only with shorter ones.
     intervals : tuple of (float, float)
         All intervals (from, to) of steps at which small oscillations about the equilibrium are stable.
     """

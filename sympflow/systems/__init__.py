@@ -117,7 +117,7 @@ def register(name: str, factory: Callable[..., HamiltonianSystem]) -> None:
         raise ValueError(f"`name` {name!r} is a built-in scene, which cannot be replaced: choose another name.")
     if key in _plugins():
         raise ValueError(
-            f"`name` {name!r} is that of the plug-in {distribution(_plugins()[key])}, which would be replaced: choose "
+            f"`name` {name!r} belongs to the plug-in {distribution(_plugins()[key])}, which would be replaced: choose "
             "another name."
         )
     if isinstance(factory, HamiltonianSystem) or not _makes_a_default(factory):

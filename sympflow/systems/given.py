@@ -15,13 +15,15 @@ if TYPE_CHECKING:
     import sympy as sp
 
 GivenSystem: TypeAlias = "HamiltonianSystem | str | sp.Basic"
-"""A system, the name of a scene, or H as a formula, in text or symbols."""
+"""A system, the name of a scene, own.py:name or own.toml, or H as a formula, in text or symbols."""
 
+FILE = re.compile(r"(?P<path>.+?\.(?:py|toml))(?::(?P<rest>.*))?", re.DOTALL)
+"""A system in a file: file.toml, file.py:name, and on the command line parameters behind them."""
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9]*([-_][A-Za-z0-9]+)*")
 
 
 def given_system(system: Any, params: Mapping[str, Any] | None = None) -> HamiltonianSystem:
-    """Return the system that an argument means: one, the name of a scene, or H as `from_sympy` takes it.
+    """Return the system that an argument means: one, the name of a scene, one in a file, or H as `from_sympy` takes it.
 
     The first values of `params` are those of the symbols of H.
     """
@@ -41,6 +43,10 @@ def given_system(system: Any, params: Mapping[str, Any] | None = None) -> Hamilt
                 else f" There are {', '.join(available())}; a formula such as 'p**2/2 + q**2/2' is a system too."
             )
             raise ValueError(f"`system` {system!r} is not the name of a scene.{hint}{names}")
+        if file := FILE.fullmatch(system):
+            from sympflow.systems.user_files import factory
+
+            return factory(file["path"], file["rest"] or None)()
         return HamiltonianSystem.from_sympy(system, params=_first(params))
     sympy = sys.modules.get("sympy")
     if sympy is not None and isinstance(system, sympy.Basic | sympy.MatrixBase):

@@ -37,7 +37,7 @@ def pair_functions(pair: Callable[..., Any], strength: np.ndarray, dim: int) -> 
         from numba import njit
     except ImportError as error:
         raise ImportError(
-            f"`pair` must be a Numba function, for which Numba is needed: {needed('numba', 'numba')}, or give the "
+            f"`pair` must be a Numba function, which needs Numba: {needed('numba', 'numba')}, or give the "
             "potential of a pair to HamiltonianSystem.pairs."
         ) from error
 

@@ -15,9 +15,9 @@ from typing import Any
 
 from sympflow.arguments import did_you_mean
 from sympflow.hamiltonian.domain import Ball, Box, EnergySublevel, Tube, domain_from_dict
-from sympflow.hamiltonian.hamiltonian import UNNAMED
 from sympflow.hamiltonian.lattice_states import LatticeStates
 from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.lazy import lately_kept
 
 DOMAINS: dict[str, tuple[str, ...]] = {  # the kinds of domains in a TOML file, and the keys of each
     "Ball": ("center", "radius"),
@@ -141,11 +141,10 @@ def _answering(function: Callable[..., Any], name: str, file: Path) -> Callable[
     return make
 
 
+@lately_kept
 def _named(system: HamiltonianSystem, name: str) -> HamiltonianSystem:
     """The system, by the name that it has in its file where it has none of its own."""
-    if system.name == UNNAMED:
-        system.name = name
-    return system
+    return system if system.scene.name else system.with_scene(name=name)
 
 
 def _of_toml(file: Path, name: str | None) -> Callable[..., HamiltonianSystem]:

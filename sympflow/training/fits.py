@@ -466,7 +466,7 @@ class LossFit(_LossFit):
         Number of equidistant times in (0, Δt] at which as many states as there are points are labelled; each step
         takes `points` of these labels.
     data : (array (n,), array (n, 2d), array (n, 2d)), optional
-        Labels of your own, of which a tenth is held out.
+        Labels of your own; a tenth is held out.
     validation_points : int
         Held-out points of the losses.
     seed, reference_states
@@ -487,7 +487,7 @@ class LossFit(_LossFit):
             given = (getattr(self, name) for name in WEIGHTS)
             weights = {n: d if w is None else w for n, w, d in zip(WEIGHTS, given, defaults, strict=True)}
         if kind == "mlp" and weights["matching_weight"]:
-            raise ValueError("`matching_weight` needs a Hamiltonian, which an MLP flow has not: leave it out.")
+            raise ValueError("`matching_weight` needs a Hamiltonian, which an MLP flow does not have: leave it out.")
         check_weights(**weights)
         found = replace(self, points=self.points or solver.POINTS, loss=None, **weights)
         if found.matching_times > min(found.points or 0, found.validation_points) // 2:
@@ -575,7 +575,7 @@ class KeplerFit(Fit):
     Parameters
     ----------
     dt : float, optional
-        Δt; by default the longest with an error of at most `tol`, of those up to a tenth of the shortest period.
+        Δt; by default the longest with an error of at most `tol`, of those up to a quarter of the shortest period.
     tol : float
         Relative energy error, where `dt` is left out.
     reach, gradients : int
@@ -601,10 +601,10 @@ class KeplerFit(Fit):
         if type(plain(self.gradients)) is not int or not 0 <= self.gradients <= 2 * self.reach:
             raise ValueError(f"`gradients` must be an integer from 0 to twice `reach`; got {self.gradients!r}: take 8.")
         if self.points < 2 * self.reach + self.gradients:
-            raise ValueError(f"`points` {self.points!r} are fewer than the numbers to be fitted: take 1500.")
+            raise ValueError(f"`points` {self.points!r} are fewer than the numbers to fit: take 1500.")
         for name in ("label_times", "reference_states"):
             if name in self.given():
-                raise TypeError(f"`{name}` is of labels, to which flows of planets are not fitted: leave it out.")
+                raise TypeError(f"`{name}` is for fits to labels, and those of planets have none: leave it out.")
 
 
 # plain keywords -------------------------------------------------------------------------------------------------

@@ -81,7 +81,7 @@ def start_times(
         system.check_times(low, high)
         if high - low <= dt:
             raise ValueError(
-                f"`system` {system.name!r} is driven, without a `period` and for t from {low:g} to {high:g}, in which "
+                f"`system` {system.name!r} is driven, without a `period` and for t from {low:g} to {high:g}, and there "
                 f"no step of dt = {dt:g} begins and ends: give it the period of the drive, or a longer `t_span`."
             )
         high -= dt

@@ -6,7 +6,7 @@ import copy
 import inspect
 import math
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -15,7 +15,6 @@ import numpy as np
 import torch
 
 from sympflow.arguments import advice, check_one_of, plain, real_number
-from sympflow.arrays import is_tensor
 from sympflow.flow.flow_map import FlowMap
 from sympflow.flow.primed import PrimedFlow
 from sympflow.flow.sympflow import SympFlow
@@ -277,9 +276,9 @@ def _refuse_unknown(options: dict[str, Any]) -> None:
 
 
 def _known_system(system: Any, data: Any) -> HamiltonianSystem:
-    """Return H, of which data alone tell nothing."""
-    is_data = isinstance(system, list | tuple | dict | np.ndarray) or is_tensor(system)
-    if not isinstance(system, HamiltonianSystem | str) and (data is not None or system is None or is_data):
+    """Return H; a TypeError for data without a system."""
+    is_data = isinstance(system, Iterable) or system is None or data is not None
+    if is_data and not isinstance(system, HamiltonianSystem | str):
         raise TypeError(
             f"`system` must be a HamiltonianSystem, the H of the flow; got {type(system).__name__}: train() fits a "
             "flow to an H that is known, and `data` adds labels to that; it finds no H in data. Define H by "
@@ -298,7 +297,7 @@ def _domain_for(system: HamiltonianSystem, domain: Domain | None) -> Domain:
         domain = _around_orbit(system)
     if domain is None:
         raise ValueError(
-            f"`domain` is not known for the system {system.called}: pass the states to train on, as by "
+            f"`domain` is not known for the system {system.name!r}: pass the states to train on, as by "
             f"domain={remedy_for(system)}."
         )
     if not isinstance(domain, Domain):
@@ -396,7 +395,7 @@ def _meant(system: HamiltonianSystem, options: dict[str, Any], searches: bool) -
     if searched and not suitable:
         raise ValueError(
             f"`{searched[0]}` is of the search for primed flows by Gauss–Newton, which needs H = ½ pᵀM⁻¹p + V(q); "
-            f"{system.called} is of another form: leave it out for a network, or pass kind='primed', optimizer='bfgs'."
+            f"{system.name!r} is of another form: leave it out for a network, or pass kind='primed', optimizer='bfgs'."
         )
     if searched or any(name in fits.OF_PRIMED for name in options):
         return "primed"
@@ -413,13 +412,13 @@ def _check_primable(system: HamiltonianSystem, given: list[str], searches: bool)
     needs = f"{named} asks for a flow primed with V and T"
     if not system.separable:
         raise ValueError(
-            f"{needs}, but the system {system.called} has one function H, not known as T(p) + V(q): leave out {named} "
+            f"{needs}, but the system {system.name!r} has one function H, not known as T(p) + V(q): leave out {named} "
             "for a network, or define the system with HamiltonianSystem.from_sympy."
         )
     if not system.quadratic_kinetic and searches:
         raise ValueError(
             f"{needs}, whose table Gauss–Newton fits only where T = ½ pᵀM⁻¹p, as it is not in the system "
-            f"{system.called}: leave out {named} for a network, or pass optimizer='bfgs'."
+            f"{system.name!r}: leave out {named} for a network, or pass optimizer='bfgs'."
         )
 
 

@@ -217,7 +217,7 @@ def test_a_blow_up_prints_no_warnings_of_numpy(tmp_path):
         (["section", "pendulum", "--coordinate", "z"], "`--coordinate` must be one of q, p"),
         (["section", "pendulum", "--orbits", "2", "--y0", "1,0"], "`--orbits` and `--y0` both choose"),
         (["section", "pendulum", "--y0", "1,0", "--y0", "1"], "`--y0` must have the same number of components"),
-        (["certificate", "pendulum", "--flow", "none"], "`--flow` 'none' is the name of no flow that ships"),
+        (["certificate", "pendulum", "--flow", "none"], "`--flow` 'none' does not name a flow that ships"),
         (["certificate", "pendulum", "--flow", "pendulum-mlp"], "`--flow` is an unconstrained network"),
         (["certificate", "pendulum", "--held-out", "0"], "`--held-out` must be an integer and at least 1"),
         (["certificate", "pendulum", "--out", "c.txt"], "`--out` must end in .json or .safetensors"),

@@ -200,7 +200,7 @@ def test_a_wrong_word_is_named(word, message, files):
         ("f.toml", "hamiltonian = p**2", "`system` 'f.toml' is not TOML"),
         ("f.toml", "y0 = " + "[" * 5000, "`system` 'f.toml' is nested too deeply"),
         ("f.toml", "dt = " + "9" * 5000, "`system` 'f.toml' is not TOML"),
-        ("f.toml", "hamiltonian = 'p**2 + q99999999999'", "`hamiltonian` has coordinates of the number 99999999999"),
+        ("f.toml", "hamiltonian = 'p**2 + q99999999999'", "`hamiltonian` has coordinates numbered up to 99999999999"),
         ("f.toml", 'hamiltonian = "p**2/2 + q**"', "`hamiltonian` cannot be parsed"),
         ("f.toml", 'hamiltonian = "p**2/2 + w*q**2"', "`hamiltonian` holds w without a value: give it in `params`"),
         ("f.toml", 'hamiltonian = "p**2 + w*q**2"\nparams = {w = "a"}', "`params` must be a table of numbers"),

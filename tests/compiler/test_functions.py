@@ -11,6 +11,7 @@ from test_functions_in_code import run
 from sympflow.compiler.functions import FUNCTIONS, MOST_DERIVATIVES, OF_SCIPY, apply
 from sympflow.compiler.program import derivatives, traced
 
+TABLES = {"entry", "interval"}
 CONDITIONS = {"lt", "le", "eq", "and", "or", "not"}
 EXACT = {  # by mpmath, of functions that have another name there
     "add": lambda a, b: a + b,
@@ -55,7 +56,7 @@ def exact(name):
     return EXACT.get(name) or getattr(mpmath, name)
 
 
-NUMERIC = [name for name in FUNCTIONS if name not in CONDITIONS | {"where", *OF_SCIPY}]
+NUMERIC = [name for name in FUNCTIONS if name not in CONDITIONS | TABLES | {"where", *OF_SCIPY}]
 
 
 @pytest.mark.parametrize("name", NUMERIC)

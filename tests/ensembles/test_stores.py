@@ -133,8 +133,7 @@ def scaled(factor):
 
 def test_a_store_is_of_one_step_and_one_function(tmp_path):
     def stored(name, dt=0.1, factor=1.0, resume=False):
-        system = sympflow.systems.henon_heiles()
-        system.dt = dt
+        system = sympflow.systems.henon_heiles().with_scene(dt=dt)
         how = {"t_eval": TIMES, "reduce": scaled(factor), "store": tmp_path / name, "resume": resume}
         return sympflow.ensemble(system, "verlet", (0, 1), STATES[:3], **how)
 

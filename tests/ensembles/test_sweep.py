@@ -155,7 +155,11 @@ def test_energy_errors_where_some_values_drive_the_system():
 @pytest.mark.parametrize(
     ("how", "error", "message"),
     [
-        ({"params": {"lam": [1.0]}}, ValueError, "`params` has 'lam', no parameter of 'henon_heiles', which has none"),
+        (
+            {"params": {"lam": [1.0]}},
+            ValueError,
+            "`params` has 'lam', which is not a parameter of 'henon_heiles', which has none",
+        ),
         ({"params": 3}, TypeError, "`params` must map names"),
         ({"workers": 0}, ValueError, "`workers` must be a positive number"),
         ({"reduce": lambda t, y: {"messages": 1.0}}, ValueError, "returns 'messages', a name that the result has"),

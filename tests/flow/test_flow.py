@@ -286,7 +286,7 @@ def test_what_is_not_a_dtype_of_a_flow_is_refused(make, dtype):
 @pytest.mark.parametrize("make", MAKERS.values(), ids=MAKERS.keys())
 def test_a_device_that_is_not_there_is_refused(make):
     for device in ("foo", "cuda:4096"):
-        with pytest.raises(ValueError, match=f"^`device` '{device}' is not to be had here .*: use device='cpu'"):
+        with pytest.raises(ValueError, match=f"^`device` '{device}' is not available here .*: use device='cpu'"):
             make(1, device=device)
     for device in (1.5, True, ["cpu"]):
         with pytest.raises(TypeError, match=r"^`device` must be a torch.device or its name.*: use 'cpu'"):

@@ -363,7 +363,7 @@ def test_bad_registrations_of_potentials_are_refused(name, potential, error):
 
 
 def test_a_potential_without_from_dict_is_not_registered():
-    with pytest.raises(TypeError, match=r"^`potential` Potential has no from_dict\(\), by which files are read"):
+    with pytest.raises(TypeError, match=r"^`potential` Potential has no from_dict\(\), which reads files"):
         register_potential("other", Potential)
 
 
@@ -389,9 +389,9 @@ def test_a_file_finds_what_installed_plugins_announce(announced, tmp_path):
     )
     flow.save(tmp_path / "flow.safetensors")
     assert torch.equal(load(tmp_path / "flow.safetensors")(0.4, states(2, 1)), flow(0.4, states(2, 1)))
-    with pytest.raises(ImportError, match=r"^`activation` 'seven' of the plug-in .* is none"):
+    with pytest.raises(ImportError, match=r"^`activation` 'seven' of the plug-in .* is not valid"):
         activation_named("seven")
-    with pytest.raises(ImportError, match=r"^`potential` 'pi' of the plug-in .* is none"):
+    with pytest.raises(ImportError, match=r"^`potential` 'pi' of the plug-in .* is not valid"):
         potentials.potential_named("pi")
 
 

@@ -106,15 +106,6 @@ def test_palindromes_halve_the_parameters():
 # processed ----------------------------------------------------------------------------------------------------
 
 
-def test_a_processed_palindrome_reverses_with_the_momenta():
-    """ρ ψ̄_t ρ = ψ̄_{−t}, as for the exact flow: every coefficient is odd in t."""
-    flow, x = processed(size=0.2), states(HH)
-    rho = torch.tensor([1.0, 1.0, -1.0, -1.0], dtype=torch.float64)
-    torch.testing.assert_close(rho * flow.psi(0.5, rho * x), flow.psi(-0.5, x), rtol=0, atol=64 * EPS)
-    y = flow.kernel_step(0.5, x)
-    torch.testing.assert_close(flow.kernel_step(-0.5, y), x, rtol=0, atol=64 * EPS)
-
-
 def test_untrained_the_processor_is_the_identity():
     x = states(HH)
     with_it, without = SympFlow.primed(HH, 3, processor=4), SympFlow.primed(HH, 3, degree=5)
@@ -156,21 +147,6 @@ def test_outputs_of_a_processed_flow_change_nothing():
     every = solve(HH, flow, span)
     np.testing.assert_array_equal(every.y[:, 0], HH.y0)
     np.testing.assert_allclose(every.y[:, -1], few, atol=1e-13)
-
-
-@pytest.mark.parametrize("backend", ["compiled", "array"])
-def test_events_and_dense_output_of_a_processed_flow(backend):
-    flow = processed(size=0.01)
-
-    def crossing(t, y):
-        return y[0]
-
-    sol = solve(HH, flow, (0.0, 20.0), events=crossing, dense_output=True, backend=backend)
-    assert len(sol.t_events[0]) > 3
-    for t, y in zip(sol.t_events[0], sol.y_events[0], strict=True):
-        np.testing.assert_allclose(flow(float(t), torch.tensor(HH.y0)).numpy(), y, atol=1e-11)
-        np.testing.assert_allclose(sol.sol(t), y, atol=1e-11)
-        assert abs(y[0]) < 1e-9
 
 
 def test_gradients_flow_through_a_processed_run():

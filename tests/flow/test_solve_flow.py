@@ -9,12 +9,9 @@ from sympflow import (
     HamiltonianSystem,
     MLPFlow,
     SympFlow,
-    get,
     solve,
-    symplecticity_defect,
     systems,
     train,
-    volume_error,
 )
 
 HH = systems.henon_heiles()
@@ -42,26 +39,12 @@ def test_solve_is_the_flow_at_every_t(flow):
     assert sol.stats["n_steps"] == 5  # four of Δt and a shorter one
 
 
-def test_the_unconstrained_flow_has_no_way_back():
-    with pytest.raises((TypeError, ValueError), match=r"^`t_span` runs backwards, but method .mlp. has no inverse"):
-        solve(HH, MLP, (1.0, 0.0))
-    with pytest.raises(TypeError, match=r"^`method` 'mlp' has no exact inverse"):
-        get("mlp")(flow=MLP).inverse(HH, 0.0, HH.y0, 0.1)
-
-
 def test_a_smaller_step_composes_another_map():
     sol = solve(HH, FLOW, (0.0, 1.0), dt=0.25, on_domain_exit="ignore")
     y = torch.tensor(HH.y0)
     for _ in range(4):
         y = FLOW(0.25, y)
     np.testing.assert_allclose(sol.y[:, -1], y.numpy(), atol=32 * EPS)
-
-
-def test_metrics_of_the_map_as_executed():
-    sol = solve(HH, FLOW, (0.0, 5.3), on_domain_exit="ignore")
-    assert symplecticity_defect(sol, relative=True) < 1e-13
-    assert abs(volume_error(sol)) < 11 * 1e-13  # 11 steps
-    assert abs(volume_error(solve(HH, MLP, (0.0, 2.0), on_domain_exit="ignore"))) > 1e-3
 
 
 def test_tensors_and_gradients_to_state_and_weights():
@@ -93,7 +76,7 @@ def test_float32():
     [
         ({"flow": FLOW, "dt": 1.0}, ValueError, r"^`dt` must be at most the flow's Δt = 0.5"),
         ({"flow": MLP}, TypeError, r"^`flow` must be a trained flow of kind 'sympflow'; got MLPFlow"),
-        ({"flow": "henon_heiles"}, ValueError, r"^`flow` 'henon_heiles' is the name of no flow that ships. Is it"),
+        ({"flow": "henon_heiles"}, ValueError, r"^`flow` 'henon_heiles' does not name a flow that ships. Is it"),
         ({"flow": "henon_heiles-mlp"}, TypeError, r"^`flow` must be a trained flow of kind 'sympflow'; got MLPFlow"),
         ({"flow": SympFlow(1)}, ValueError, r"^`system` .* degrees of freedom"),
         ({"flow": FLOW, "dtype": "float32"}, TypeError, r"^`y0` is .*float32, but the flow's weights .* pass flow.to"),
@@ -103,21 +86,6 @@ def test_float32():
 def test_bad_arguments_are_named(arguments, error, message):
     with pytest.raises(error, match=message):
         solve(HH, "sympflow", (0.0, 1.0), **arguments)
-
-
-def test_a_system_without_a_shipped_flow_says_how_to_train_one():
-    with pytest.raises(ValueError, match=r"^`system` .* no shipped sympflow flow .* train"):
-        solve(systems.harmonic_oscillator(3.7), "sympflow")
-
-
-@pytest.mark.parametrize("batch", [(), (2, 3)])
-@pytest.mark.parametrize("span", [(0.0, 7.3), (7.3, 0.0)])
-def test_compiled_and_array_results_agree_to_rounding(batch, span):
-    kwargs = {"flow": FLOW, "y0": Y0[(0,) * (2 - len(batch))], "on_domain_exit": "ignore"}
-    array = solve(HH, "sympflow", span, backend="array", **kwargs)
-    compiled = solve(HH, "sympflow", span, backend="compiled", **kwargs)
-    assert (array.stats["backend"], compiled.stats["backend"]) == ("torch", "compiled")
-    np.testing.assert_allclose(compiled.y, array.y, atol=1e4 * EPS)  # 15 steps that amplify rounding
 
 
 def test_a_forced_backend_that_does_not_apply_says_why():

@@ -2,6 +2,7 @@
 
 import json
 import struct
+from functools import cache
 
 import mpmath
 import numpy as np
@@ -182,6 +183,7 @@ SQUARES = [
 ]
 
 
+@cache
 def of_sinc(V):
     return HamiltonianSystem.from_sympy(f"p**2/2 + {V}", params={"k": 1.3} if "k*" in V else None)
 

@@ -8,7 +8,6 @@ import re
 
 import numpy as np
 import pytest
-import sympy as sp
 import torch
 
 import sympflow as sf
@@ -303,17 +302,3 @@ class TestPoles:
         assert HamiltonianSystem.lattice(
             bond=bond, params={"n": 6.0} if "n)" not in bond and "-n" in bond else None, shape=6
         ).definition.poles
-
-
-def test_derivatives_are_made_once(monkeypatch):
-    """Array functions of a lattice differentiate expressions when they are generated, not in each call."""
-    lattice = HamiltonianSystem.lattice(onsite="q**4/4", bond="exp(r) - r", kinetic="sqrt(1 + p**2)", shape=8).local
-    x = np.linspace(-0.4, 0.4, 8)
-
-    def values():
-        return [lattice.potential_gradient(x), lattice.hessian_vector(x, x), lattice.kinetic_gradient(x)]
-
-    first = values()
-    monkeypatch.setattr(sp, "diff", None)
-    for again, value in zip(values(), first, strict=True):
-        np.testing.assert_array_equal(again, value)

@@ -78,7 +78,7 @@ def test_a_bad_stiffness_matrix_is_refused(matrix):
 
 def test_a_logarithmic_hamiltonian_of_functions_has_no_linear_part():
     system = HamiltonianSystem(lambda q: -1 / (torch.cummax(q, -1).values ** 2).sum(-1) ** 0.5, ndof=2, y0=[1, 0, 0, 1])
-    with pytest.raises(ValueError, match=r"^`system` .* no linear part can be read"):
+    with pytest.raises(ValueError, match=r"^`system` .* whose linear part is not known"):
         _ = time_transformed(system).linear_part
 
 

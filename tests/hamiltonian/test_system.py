@@ -195,7 +195,7 @@ class TestNumbaFunctions:
         (lambda: made("p**2/2 + ("), ValueError, "^`expression` cannot be parsed"),
         (lambda: made("p1**2 + q + q2"), ValueError, "^`expression` mixes q, p"),
         (lambda: made("p1**2 + q1 + q"), ValueError, "^`expression` mixes q, p"),
-        (lambda: made("p**2 + q99999999999"), ValueError, "^`expression` has coordinates of the"),
+        (lambda: made("p**2 + q99999999999"), ValueError, "^`expression` has coordinates numbered up"),
         (lambda: made("p1**2 + q" + "9" * 5000), ValueError, "holds q9{39}… without"),
         (lambda: made("3"), ValueError, "^`expression` must depend on q1"),
         (lambda: made("p**2 + q", params={"k": 1}), ValueError, "^`params` has 'k'"),
@@ -279,7 +279,7 @@ def test_kinks_and_constants_after_differentiation(q):
 def test_special_functions_run_on_arrays_and_torch_says_that_it_has_none():
     system = made("p**2/2 - besselj(0, q)")
     assert system.force(np.array([0.3]))[0] == pytest.approx(-0.148318816)
-    with pytest.raises(TypeError, match=r"^`expression` holds besselj, which torch has not"):
+    with pytest.raises(TypeError, match=r"^`expression` holds besselj, which torch does not have"):
         system.force(torch.tensor([0.3]))
 
 
@@ -405,17 +405,6 @@ class TestParameters:
     def test_of_the_scene_are_checked_too(self, scene, error):
         with pytest.raises(error, match=f"^`{next(iter(scene))}` must be"):
             made("p**2/2 + q**2/2", **scene)
-
-
-def test_a_pickle_of_a_version_that_tested_no_functions_is_read():
-    system = systems.fput(m=1, omega=10.0)
-    state = {k: v for k, v in vars(system).items() if k not in ("functions_given", "_checked", "_params")}
-    old = HamiltonianSystem.__new__(HamiltonianSystem)
-    old.__setstate__({**state, "params": {"omega": 10.0}})
-    assert old.params == system.params
-    assert old.fingerprint == system.fingerprint
-    old.check_functions()
-    np.testing.assert_array_equal(pickle.loads(pickle.dumps(old)).force(old.y0[:2]), system.force(old.y0[:2]))
 
 
 def test_long_sums_are_evaluated_in_pieces(monkeypatch):

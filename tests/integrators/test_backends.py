@@ -5,34 +5,11 @@ import pytest
 import torch
 
 from sympflow import HamiltonianSystem, solve, systems
-from sympflow.compiler import NotCompiled
-from sympflow.integrators.steppers import compiled_loops
-from sympflow.schemes import SCHEMES
 
 HH = systems.henon_heiles()
 PLAIN = HamiltonianSystem(lambda q: np.median(q, axis=-1) ** 4, ndof=1, y0=[1.0, 0.0], gradient=lambda q: 4 * q**3)
 TRACED = HamiltonianSystem(lambda q: (q**4).sum(-1), ndof=1, y0=[1.0, 0.0])
 AIRY = HamiltonianSystem.from_sympy("p**2/2 - airyai(q)", y0=[1.0, 0.0])
-
-
-@pytest.mark.parametrize("method", sorted(SCHEMES))
-def test_evaluations_are_counted_as_they_are_made(method):
-    calls = {"force": 0, "hessian": 0}
-
-    def gradient(q):
-        calls["force"] += 1
-        return q**3
-
-    def hessian_vector(q, v):
-        calls["hessian"] += 1
-        return 3 * q**2 * v
-
-    system = HamiltonianSystem(
-        lambda q: (q**4).sum(-1) / 4, gradient=gradient, hessian_vector=hessian_vector, ndof=1, check=False
-    )
-    sol = solve(system, method, (0.0, 1.0), y0=[1.0, 0.0], dt=0.1)
-    assert sol.stats["force_evaluations"] == calls["force"]
-    assert sol.stats["hessian_evaluations"] == calls["hessian"]
 
 
 def test_the_compiled_count_merges_the_last_kick_with_the_next_first():
@@ -80,18 +57,6 @@ def test_a_backend_that_does_not_apply_says_why(system, arguments, message):
         solve(system, **{"method": "verlet", "t_span": (0.0, 1.0), **arguments})
 
 
-def test_only_an_error_that_says_so_means_array_operations():
-    def refused():
-        raise NotCompiled("`system` has no loops.")
-
-    def broken():
-        raise ValueError("a fault of the loops")
-
-    assert compiled_loops(refused, np.zeros(2), "auto") is None
-    with pytest.raises(ValueError, match="a fault"):
-        compiled_loops(broken, np.zeros(2), "auto")
-
-
 @pytest.mark.parametrize("q", [1e12, 1e16, 1e18, 1e21, 1e100, 1e300])
 def test_sines_of_far_states_stay_bounded(q):
     sol = solve(systems.pendulum(), "verlet", (0.0, 0.01), y0=[q, 0.0], dt=0.01)
@@ -103,34 +68,3 @@ def test_steps_are_counted_once():
     sol = solve(HH, "verlet", (0.0, 10.0), dt=0.1, t_eval=[0.05, 10.0])
     assert sol.stats["n_steps"] == 100
     assert solve(HH, "verlet", (0.0, 10.03), dt=0.1).stats["n_steps"] == 101
-
-
-BODIES = HamiltonianSystem.pairs("-m1*m2/r", masses=[1.0, 0.5, 0.3], dim=2)
-CLUSTER = HamiltonianSystem.pairs("-m1*m2/sqrt(r**2 + 0.01)", masses=np.linspace(1.0, 2.0, 10), dim=2, damping=0.1)
-CHAIN = HamiltonianSystem.lattice(
-    shape=12, onsite="k*q**2/2 + q**4/4", bond="r**2/2", params={"k": np.linspace(1, 2, 12)}
-)
-
-
-@pytest.mark.parametrize(
-    ("system", "method", "options"),
-    [
-        (BODIES, "gauss_legendre4", {}),
-        (BODIES, "rk4", {}),
-        (BODIES, "tao4", {"omega": 2.0}),
-        (BODIES, "log_kahan_li8", {}),
-        (CLUSTER, "gauss_legendre4", {}),
-        (CLUSTER, "rk4", {}),
-        (CHAIN, "implicit_midpoint", {}),
-        (CHAIN, "heun3", {}),
-        (CHAIN, "log_kahan_li8", {"shift": 200.0}),
-    ],
-)
-def test_systems_by_one_piece_run_compiled_as_their_terms(system, method, options):
-    y0, run = np.random.default_rng(3).normal(size=2 * system.ndof), {"t_span": (0, 0.05), "dt": 0.01, **options}
-    sol, arrays = (solve(system, method, y0=y0, backend=backend, **run) for backend in ("auto", "array"))
-    assert sol.stats["backend"] == "compiled"
-    np.testing.assert_allclose(sol.y, arrays.y, rtol=0, atol=1e-12)
-    if system is BODIES:
-        text = HamiltonianSystem.from_sympy(str(system.written.H))
-        np.testing.assert_allclose(sol.y, solve(text, method, y0=y0, **run).y, rtol=0, atol=1e-13)

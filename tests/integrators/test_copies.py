@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import sympflow
-from sympflow import HamiltonianSystem, systems
+from sympflow import systems
 from sympflow.interop.scipy import as_scipy
 
 pytestmark = pytest.mark.filterwarnings("ignore:`dt` .* is too long:RuntimeWarning")
@@ -31,28 +31,6 @@ def test_a_run_is_symplectic_on_the_two_copies_and_keeps_the_energy(system):
     assert sol.stats["copy_distance"] < 1e-2
 
 
-def test_compiled_arrays_functions_and_tensors_agree(system):
-    y0 = np.array(system.y0) * np.linspace(0.8, 1.0, 3)[:, None]
-    options = {"dt": 0.05, "omega": 4.0, "t_eval": [0.5, 1.03]}
-    compiled = sympflow.solve(system, "tao4", (0, 1.03), y0, **options)
-    assert compiled.stats["backend"] == "compiled"
-    arrays = sympflow.solve(system, "tao4", (0, 1.03), y0, backend="array", **options)
-    np.testing.assert_allclose(arrays.y, compiled.y, rtol=0, atol=1e-13)
-    functions = HamiltonianSystem(
-        hamiltonian=lambda q, p: ((q**2 + 1) * (p**2 + 1) / 2).sum(-1), ndof=1, y0=system.y0, dt=0.05
-    )
-    plain = sympflow.solve(functions, "tao4", (0, 1.03), y0, **options)
-    np.testing.assert_allclose(plain.y, compiled.y, rtol=0, atol=1e-12)
-
-    start = torch.tensor(y0, requires_grad=True)
-    tensors = sympflow.solve(system, "tao4", (0, 1.03), start, **options)
-    np.testing.assert_allclose(tensors.y.detach(), compiled.y, rtol=0, atol=1e-13)
-    slope = torch.autograd.grad(tensors.y[0, 0, -1], start)[0][0, 0]
-    shift = np.array([[1e-6, 0], [0, 0], [0, 0]])
-    ends = [sympflow.solve(system, "tao4", (0, 1.03), y0 + s * shift, **options).y[0, 0, -1] for s in (1, -1)]
-    assert float(slope) == pytest.approx((ends[0] - ends[1]) / 2e-6, rel=1e-6)
-
-
 def test_events_and_dense_output_are_of_the_mean_of_the_copies(system):
     sol = sympflow.solve(system, "tao6", (0, 5), dt=0.02, events=lambda t, y: y[0], dense_output=True)
     exact = sympflow.solve(system, "dop853", (0, 5), events=lambda t, y: y[0], rtol=1e-12, atol=1e-13)
@@ -60,11 +38,6 @@ def test_events_and_dense_output_are_of_the_mean_of_the_copies(system):
     assert sol.y_events[0].shape == (len(sol.t_events[0]), 2)
     assert np.abs(sol.y_events[0][:, 0]).max() < 1e-12
     np.testing.assert_allclose(sol.sol(sol.t), sol.y, rtol=0, atol=1e-14)
-
-
-def test_copies_that_drift_apart_are_told(system):
-    with pytest.warns(RuntimeWarning, match="two copies that method 'tao4' keeps differ by up to .* change `omega`"):
-        sympflow.solve(system, "tao4", (0, 100), dt=0.05, omega=0.5)
 
 
 def test_lanes_of_vmap_run_as_they_do_alone_and_are_told_likewise(system):

@@ -7,7 +7,6 @@ from scipy.interpolate import CubicSpline
 
 import sympflow
 from sympflow import HamiltonianSystem, get, solve
-from sympflow.kernels.protocol import RunCheckpoint
 
 made = HamiltonianSystem.from_sympy
 SCENE = {"time": "t", "t_span": (0.3, 2.3), "dt": 0.05}
@@ -55,48 +54,6 @@ def test_every_splitting_keeps_its_order(system, method, options):
     assert np.log2(errors[0] / errors[1]) > order - 0.35
 
 
-@pytest.mark.parametrize(
-    ("system", "method"),
-    [
-        (COPIES, "tao4"),
-        pytest.param(LINEAR, "linear_omelyan4", marks=pytest.mark.slow),
-        pytest.param(POLAR, "kahan_li6_parts", marks=pytest.mark.slow),
-    ],
-)
-def test_compiled_runs_are_those_of_arrays_and_tensors(system, method):
-    times = np.append(np.linspace(0.33, 1.9, 17), 2.0)
-    start = np.asarray(system.y0)
-    found = solve(system, method, (0.3, 2.0), t_eval=times)
-    assert found.stats["backend"] == "compiled"
-    batch = solve(system, method, (0.3, 2.0), np.stack([1.1 * start, start]), t_eval=times)
-    arrays = solve(system, method, (0.3, 2.0), t_eval=times, backend="array")
-    tensors = solve(system, method, (0.3, 2.0), torch.from_numpy(start.copy()), t_eval=times)
-    for other in (batch.y[1], arrays.y, tensors.y.numpy()):
-        assert np.abs(other - found.y).max() < 1e-13
-    event = solve(system, method, (0.3, 2.0), events=lambda t, y: y[0] - 0.2 * t, dense_output=True)
-    t = event.t_events[0][0]
-    assert abs(event.sol(t)[0] - 0.2 * t) < 1e-12
-    assert sympflow.symplecticity_defect(found).max() < 1e-13
-
-
-def test_loops_over_parts_take_the_time():
-    found, arrays = (solve(POLAR, "strang_parts", (0.3, 2.0), backend=each).y for each in ("compiled", "array"))
-    np.testing.assert_allclose(found, arrays, rtol=0, atol=1e-13)
-
-
-def test_a_run_that_is_cut_goes_on_at_its_time():
-    method = get("tao4")()
-    composition = method.composed(COPIES)
-    kernel, start = composition.kernel(False), composition.lift(np.stack([COPIES.y0, 1.1 * COPIES.y0]))
-    whole = kernel.run(0.05, start, 9, np.array([4, 9]), t0=0.3).states
-    carry = RunCheckpoint()
-    pieces = [kernel.run(0.05, start, n, np.array([n]), carry=carry, t0=0.3).states for n in (4, 9)]
-    np.testing.assert_array_equal(np.concatenate(pieces, axis=1), whole)
-    one, carry = kernel.run(0.05, start[0], 9, np.array([4, 9]), t0=0.3).states, RunCheckpoint()
-    pieces = [kernel.run(0.05, start[0], n, np.array([n]), carry=carry, t0=0.3).states for n in (4, 9)]
-    np.testing.assert_array_equal(np.concatenate(pieces), one)
-
-
 @pytest.mark.parametrize(("system", "method"), [(LINEAR, "linear_omelyan4"), (POLAR, "strang_parts")])
 def test_a_step_has_its_inverse_at_its_time(system, method):
     integrator, t = get(method)(), np.array([0.4, 1.3])
@@ -122,12 +79,6 @@ def test_functions_of_the_time():
     stiff = HamiltonianSystem(V, stiffness_matrix=[[16.0]], **scene)
     symbols = made("p**2/2 + 8*q**2 + q**4/4*(1 + sin(t))", y0=[0.7, 0.3], **SCENE)
     np.testing.assert_allclose(solve(stiff, "impulse").y, solve(symbols, "impulse", **arrays).y, rtol=0, atol=1e-12)
-
-
-def test_the_energy_balance_is_that_of_the_steps():
-    runs = [solve(LINEAR, "linear_srkn6b", dt=dt, backend="array") for dt in (0.05, 0.025)]
-    errors = [sympflow.energy_balance_error(sol).max() for sol in runs]
-    assert errors[0] / errors[1] > 2**3.5
 
 
 @pytest.mark.parametrize(

@@ -12,21 +12,6 @@ from sympflow.systems import fput, harmonic_oscillator, henon_heiles, spring_pen
 from sympflow.systems.chains import oscillatory_energies
 
 
-@pytest.mark.parametrize(
-    "name", ["impulse", "mollified_impulse", pytest.param("linear_omelyan4", marks=pytest.mark.slow), "strang_parts"]
-)
-def test_compiled_array_and_tensor_runs_agree(name):
-    system = henon_heiles()
-    y0 = system.y0 * np.linspace(0.7, 1.0, 3)[:, None]
-    t = np.array([0.0, 0.1, 0.37, 0.9])
-    runs = [solve(system, name, (0, 1), y0=y, dt=0.1, t_eval=t, backend=b).y for y, b in ((y0, "auto"), (y0, "array"))]
-    runs.append(solve(system, name, (0, 1), y0=torch.as_tensor(y0), dt=0.1, t_eval=t).y.numpy())
-    alone = solve(system, name, (0, 1), y0=y0[1], dt=0.1, t_eval=t).y
-    for run in runs[1:]:
-        assert np.abs(run - runs[0]).max() < 1e-12
-    assert np.abs(alone - runs[0][1]).max() < 1e-12
-
-
 def test_fput_figures():
     """The known figures at hω = 5, T = 200, and the adiabatic invariant."""
     system = fput(omega=50.0)
@@ -44,8 +29,8 @@ def test_fput_figures():
 def test_evaluations_are_those_of_the_scheme():
     system = fput(omega=50.0)
     assert solve(system, "linear_srkn11b", (0, 10), dt=0.1, t_eval=[10.0]).stats["force_evaluations"] == 1101
-    stats = solve(system, "impulse", (0, 10), dt=0.1, t_eval=[10.0], backend="array").stats
-    assert stats["force_evaluations"] == 200
+    stats = solve(system, "impulse", (0, 10), dt=0.05, t_eval=[10.0], backend="array").stats
+    assert stats["force_evaluations"] == 400
     assert all(type(stats[f"{kind}_evaluations"]) is int for kind in ("force", "hessian"))  # JSON takes no others
 
 

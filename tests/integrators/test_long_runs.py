@@ -35,18 +35,6 @@ class Told(list):
             raise KeyboardInterrupt
 
 
-@pytest.mark.parametrize("t_eval", [None, TIMES], ids=["steps", "times"])
-@pytest.mark.parametrize("y0", [SYSTEM.y0, BATCH], ids=["one", "batch"])
-@pytest.mark.parametrize("backend", ["compiled", "array"])
-def test_windows_give_the_bits_of_one_piece(short_windows, backend, y0, t_eval):
-    options = {"t_eval": t_eval, "dt": DT, "backend": backend}
-    whole = solve(SYSTEM, "verlet", SPAN, y0, **options)
-    cut = solve(SYSTEM, "verlet", SPAN, y0, progress=Told(), **options)
-    np.testing.assert_array_equal(cut.y, whole.y)
-    np.testing.assert_array_equal(cut.t, whole.t)
-    assert {**cut.stats, "wall_time": 0} == {**whole.stats, "wall_time": 0}
-
-
 def test_a_run_that_fails_in_a_window_ends_as_in_one_piece(short_windows):
     y0 = np.array([BATCH[0], [0.0, 1.5, 1.0, 1.0], BATCH[1]])
     for start in (y0, y0[1]):

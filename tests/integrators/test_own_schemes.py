@@ -143,7 +143,7 @@ def test_a_registered_scheme_is_a_method_and_a_start_of_a_flow(announced):
     register("third", RUTH3)
     assert get("third")().name == "third"
     assert SympFlow.primed(HH, scheme="third", dt=0.5, palindromic=False).scheme(0.5).force_evaluations == 3
-    with pytest.raises(ValueError, match=r"^`name` 'ruth' is that of the plug-in"):
+    with pytest.raises(ValueError, match=r"^`name` 'ruth' belongs to the plug-in"):
         register("ruth", RUTH3)
     with pytest.raises(ValueError, match=r"^`scheme` 'ruth3' has kicks that add up to"):
         register("bad", replace(RUTH3, kicks=(0.5, 0.5, 0.5)))

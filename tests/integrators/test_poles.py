@@ -1,5 +1,6 @@
 """Runs over places at which H is infinite or NaN, and runs near them."""
 
+import re
 import warnings
 
 import numpy as np
@@ -83,7 +84,7 @@ def of_functions(V):
     return HamiltonianSystem(lambda q: potential(q[..., 0]), ndof=1)
 
 
-@pytest.mark.parametrize("V", [*CROSSED][::2])
+@pytest.mark.parametrize("V", [pytest.param(V, marks=pytest.mark.slow if i % 2 else ()) for i, V in enumerate(CROSSED)])
 def test_a_run_of_functions_ends_there_too(V):
     y0, dt, t1 = CROSSED[V]
     sols = [solved(f, "verlet", (0, t1), y0, dt=dt)[0] for f in (of_functions(V), in_units(V, 1.0))]
@@ -331,3 +332,44 @@ def test_stored_runs_are_looked_after(tmp_path, y0, more):
         np.testing.assert_array_equal(sol.status, kept.status)
         np.testing.assert_array_equal(sol.stats.get("failed_at", np.nan), kept.stats.get("failed_at", np.nan))
         assert ("What the store holds after that means nothing" in sol.message) == bool(np.any(kept.status))
+
+
+COLLISIONS = {
+    "rest": ("p**2/2 - 1/Abs(q)", [1.0, 0.0], np.pi / 8**0.5),
+    "plane": ("(p1**2 + p2**2)/2 - 1/sqrt(q1**2 + q2**2)", [0.6, 0.8, 0.0, 0.0], np.pi / 8**0.5),
+    "two bodies": ("p1**2/2 + p2**2/4 - 2/Abs(q1 - q2)", [0.0, 1.0, 0.3, 0.6], np.pi / 24**0.5),
+    "repelled": ("p**2/2 + 1/q**2", [1.0, -3.0], None),
+    "past": ("(p1**2 + p2**2)/2 - 1/sqrt(q1**2 + q2**2)", [1.0, 0.0, 0.0, 1e-4], None),
+    "ends before": ("p**2/2 - 1/q", [9.0, 0.0], None),
+}
+"""H, a start, and the time in which it falls into the centre: π/√8 · (r³/GM)^½ from rest at r."""
+
+
+def time_told(message):
+    return float(re.search(r"at about t = ([^,]*),", message)[1])
+
+
+@pytest.mark.parametrize("s", [1e-9, 1.0, 1e11])
+@pytest.mark.parametrize("method", ["log_leapfrog", "log_kahan_li8"])
+@pytest.mark.parametrize("name", COLLISIONS)
+def test_a_run_that_turns_at_a_collision_is_warned_of(name, method, s):
+    H, y0, t = COLLISIONS[name]
+    d = len(y0) // 2
+    system = HamiltonianSystem.from_sympy(
+        re.sub(r"([qp]\d?)\b", lambda x: f"({x[0]}{'/s' if x[0][0] == 'q' else '*s'})", H), params={"s": s}
+    )
+    start = np.array(y0) * np.repeat([s, 1 / s], d)
+    sol, told = solved(system, method, (0, 3), start, dt=0.01)
+    assert sol.success
+    assert [time_told(each) for each in told] == ([] if t is None else [pytest.approx(t, rel=1e-6)])
+
+
+def test_a_planet_that_falls_into_its_star_is_told():
+    r, v = 1.0, 0.25  # mass 1 and G = 1: a = 1/(2/r − v²), and the way inward of a radial orbit that begins outward
+    system = HamiltonianSystem.planets([1.0, 1e-9], y0=[0, 0, 0, r, 0, 0, 0, 0, 0, 1e-9 * v, 0, 0], G=1.0)
+    a = 1 / (2 / r - v * v)
+    u = np.arccos(1 - r / a)  # r = a(1 − cos u)
+    t = a**1.5 * (2 * np.pi - (u - np.sin(u)))
+    sol, [told] = solved(system, "wisdom_holman", (0, 5), dt=0.05)
+    assert sol.success
+    assert time_told(told) == pytest.approx(t, rel=1e-6)

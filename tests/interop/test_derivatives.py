@@ -11,7 +11,7 @@ from torch.autograd.functional import jacobian
 from torch.func import functional_call, grad, hessian, jacfwd, jacrev, jvp, vjp, vmap
 
 from sympflow import HamiltonianSystem, MLPFlow, SympFlow, get, solve, systems
-from sympflow.interop.torchdiffeq import odeint, odeint_adjoint, odeint_dense, odeint_event
+from sympflow.interop.torchdiffeq import odeint, odeint_dense, odeint_event
 
 PENDULUM, OSCILLATOR = systems.pendulum(), systems.harmonic_oscillator()
 KINDS = ["verlet", "kahan_li8", "chin4a", "gauss_legendre4", "strang_parts", "mollified_impulse", "sympflow", "mlp"]
@@ -113,20 +113,6 @@ class TestEveryTransform:
             torch.testing.assert_close(vmap(jacfwd(f))(Y), J, **CLOSE)
         each = torch.stack([by_odeint(y, t) for y, t in zip(Y, TIMES, strict=True)])
         torch.testing.assert_close(vmap(by_odeint)(Y, TIMES), each, **CLOSE)  # each lane counts its own steps
-
-
-def test_forward_mode_as_torchdiffeqs_rk4():
-    """The Jacobian that a fixed-step method of torchdiffeq gives, to the error of either method."""
-
-    def end(method, dt):
-        return jacobian(
-            lambda y: odeint(PENDULUM, y, T, method=method, options={"step_size": dt})[-1],
-            Y[0],
-            strategy="forward-mode",
-            vectorize=True,
-        )
-
-    torch.testing.assert_close(end("kahan_li8", 0.05), end("rk4", 0.01), rtol=0, atol=1e-8)
 
 
 FLOWS = {
@@ -243,15 +229,6 @@ class TestNumbersOfH:
         differences = (end(mass + small) - end(mass - small)) / (2 * small)
         torch.testing.assert_close(derivative(end)(mass), differences, rtol=0, atol=1e-8)
 
-    @pytest.mark.parametrize("transform", [jacfwd, jacrev, tangent_along_ones, lambda f, k: vmap(f)(k[None])])
-    def test_the_adjoint_of_them_is_refused(self, transform):
-        def end(k):
-            return odeint_adjoint(self.system(k), self.y0, T, method="verlet", options={"dt": 0.1})[-1]
-
-        with pytest.raises(TypeError, match=r"^`odeint_adjoint` is for reverse mode"):
-            apply = transform(end) if transform in (jacfwd, jacrev) else partial(transform, end)
-            apply(torch.tensor(1.3, dtype=torch.float64))
-
 
 class TestEvents:
     def event(self, y, method="verlet"):
@@ -275,10 +252,6 @@ class TestEvents:
             rtol=0,
             atol=1e-9,
         )
-
-    def test_hidden_values_are_refused(self):
-        with pytest.raises(TypeError, match=r"^`event_fn` is followed by the values.*torch\.func\.vmap"):
-            vmap(lambda y: self.event(y)[0])(Y)
 
 
 def test_the_state_at_a_terminal_event_of_solve_says_that_it_has_no_derivative():

@@ -199,24 +199,6 @@ class TestAnotherSystem:
         with pytest.raises(ValueError, match=r"^`fun` is not the system that method 'verlet' solves: at t = \d"):
             solve_ivp(fun, (0, 60), [0.0, 1.9], method=as_scipy("verlet", PENDULUM))
 
-    def test_a_second_run_compares_along_its_way_only(self):
-        calls = []
-
-        def fun(t, y):
-            calls.append(t)
-            return pendulum(t, y)
-
-        Verlet = as_scipy("verlet", PENDULUM, dt=0.1)
-        counts = []
-        for t_end in (1.0, 1.0, 2.0, 1.5):
-            before = len(calls)
-            sol = solve_ivp(fun, (0, t_end), [0.0, 1.0], method=Verlet)
-            counts.append(len(calls) - before)
-            assert sol.nfev > counts[-1]
-        first, again, longer, within = counts
-        assert first > 10 > again == within - 1  # 15 steps: one comparison on the way
-        assert longer > 10
-
     def test_that_has_another_number_of_variables_to_compare(self):
         with pytest.raises(ValueError, match=r"^`fun` is not the system that method 'verlet' solves: their Hamilt"):
             solve_ivp(HH, (0, 1), HH.y0[:2], method=as_scipy("verlet", PENDULUM))

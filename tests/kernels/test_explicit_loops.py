@@ -4,10 +4,8 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
 
-from sympflow import HamiltonianSystem, doubled, solve, systems
-from sympflow.integrators.tableaux import FIXED
-from sympflow.kernels.explicit_loops import compiled_field, explicit_kernel
-from sympflow.kernels.protocol import RunCheckpoint
+from sympflow import HamiltonianSystem, doubled, systems
+from sympflow.kernels.explicit_loops import compiled_field
 
 made, EPS = HamiltonianSystem.from_sympy, np.finfo(float).eps
 T, CHAIN = np.linspace(0, 9, 30), range(1, 20)
@@ -37,38 +35,3 @@ def test_the_compiled_field_is_the_vector_field(system):
         y = rng.normal(0, 0.5, 2 * system.ndof)
         expected = system.vector_field(y, t)
         np.testing.assert_allclose(field(t, y), expected, rtol=0, atol=50 * EPS * (1 + np.abs(expected).max()))
-
-
-@pytest.mark.parametrize(
-    ("name", "method"), [*((name, "rk4") for name in SYSTEMS), *(("driven", m) for m in FIXED if m != "rk4")]
-)
-def test_compiled_steps_are_those_of_arrays(name, method):
-    system, rng = SYSTEMS[name], np.random.default_rng(0)
-    y0 = system.y0 * (1 + 0.1 * rng.random((3, 2 * system.ndof)))
-    runs = [solve(system, method, (0, 2), y0=y0, t_eval=[0, 1.23, 2], backend=b) for b in ("compiled", "array")]
-    assert [run.stats["backend"] for run in runs] == ["compiled", "numpy"]
-    assert runs[0].stats["force_evaluations"] == runs[1].stats["force_evaluations"]
-    np.testing.assert_allclose(runs[0].y, runs[1].y, rtol=0, atol=100 * 20 * EPS)
-
-
-@pytest.mark.parametrize("name", SYSTEMS)
-def test_rows_pieces_and_single_steps_give_the_same_bits(name):
-    system, rng, save = SYSTEMS[name], np.random.default_rng(0), np.array([0, 1, 7, 30])
-    kernel, t = explicit_kernel(system, FIXED["rk4"]), {} if system.autonomous else {"t0": 0.5}
-    y0 = system.y0 * (1 + 0.1 * rng.random((11, 2 * system.ndof)))
-    batch, carry = kernel.run(0.02, y0, 30, save, **t).states, RunCheckpoint()
-    assert np.array_equal(batch, [kernel.run(0.02, y, 30, save, **t).states for y in y0])
-    pieces = [kernel.run(0.02, y0, n, s, carry=carry, **t).states for n, s in ((7, save[:3]), (30, save[3:]))]
-    assert np.array_equal(batch, np.concatenate(pieces, axis=1))
-    times = (np.full(11, 0.5),) if t else ()
-    assert np.array_equal(kernel.step(np.full(11, 0.02), y0, *times).states, batch[:, 1])
-
-
-def test_a_run_that_ends_keeps_its_finite_states():
-    """H = p²/2 − q⁴ from (1, 1), where p = √(2q⁴ − 1), is at infinity at t = ∫₁^∞ dq/√(2q⁴ − 1) = 0.76."""
-    system = made("p**2/2 - q**4", y0=[1.0, 1.0], dt=0.01)
-    runs = [solve(system, "rk4", (0, 5), backend=b) for b in ("compiled", "array")]
-    assert [run.status for run in runs] == [-1, -1]
-    assert len(runs[0].t) == len(runs[1].t)
-    assert 0.76 < runs[0].t[-1] < 0.85
-    assert np.isfinite(runs[0].y).all()

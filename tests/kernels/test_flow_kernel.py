@@ -7,10 +7,9 @@ import pytest
 import torch
 
 from sympflow.flow.layers import Drift, Kick
-from sympflow.flow.potentials import ACTIVATIONS, MLPPotential
+from sympflow.flow.potentials import MLPPotential
 from sympflow.flow.scaling import Scaling
 from sympflow.flow.sympflow import SympFlow
-from sympflow.kernels.activations import SLOPES
 
 ROUNDING = 2e-14  # a few dozen operations on numbers up to 10
 
@@ -77,16 +76,6 @@ def test_each_state_can_have_its_own_time(flow):
     assert np.abs(flow.kernel_for(None).step(h, y).states - expected).max() < ROUNDING
     assert np.array_equal(flow.kernel_for(None).step(0.0, y).states, y)
     assert np.abs(flow.kernel_for(None).step(-h, expected).states - y).max() < ROUNDING
-
-
-@pytest.mark.parametrize("name", ACTIVATIONS)
-def test_every_activation_and_its_slope(name):
-    """The functions that the loops are compiled with."""
-    x = torch.linspace(-30, 30, 401, dtype=torch.float64, requires_grad=True)
-    value = ACTIVATIONS[name].value(x)
-    (slope,) = torch.autograd.grad(value.sum(), x)
-    found = np.stack(SLOPES[name](x.detach().numpy()))
-    np.testing.assert_allclose(found, torch.stack([value, slope]).detach().numpy(), rtol=1e-14, atol=1e-14)
 
 
 @pytest.mark.parametrize(("hidden", "activation"), [((4, 7, 3), "logcosh"), ((20, 18), "sin")])

@@ -186,15 +186,6 @@ def test_a_run_in_pieces_has_the_bits_of_one(compensated, pieces):
         np.testing.assert_array_equal(np.stack(parts), whole)
 
 
-def test_events_and_dense_output_of_a_ring():
-    found = solve(
-        ring(), "srkn6b", t_span=(0, 5), y0=start(ring()), dt=0.05, events=lambda t, y: y[0], dense_output=True
-    )
-    assert found.stats["backend"] == "compiled"
-    assert len(found.t_events[0]) > 0
-    assert np.abs(found.sol(found.t_events[0])[0]).max() < 1e-10
-
-
 @pytest.mark.parametrize("shape", [48, (6, 9)])
 def test_compensated_sums_lower_the_rounding(shape):
     """There and back by a symmetric scheme: what is left is rounding, whatever the error of the method."""

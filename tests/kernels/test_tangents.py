@@ -38,7 +38,7 @@ def shapes():
 @pytest.mark.parametrize(("make", "name"), [*shapes()])
 def test_steps_and_their_jacobians_are_those_of_differentiated_steps(make, name, room, monkeypatch):
     monkeypatch.setattr(tangents, "MOST_WRITTEN_OUT", 0 if room else 10**6)
-    monkeypatch.setattr("sympflow.kernels.splittings._CODES", {})
+    monkeypatch.setattr("sympflow.kernels.rollouts._CODES", {})
     system, integrator = make(), build(name, {})
     rng = np.random.default_rng(0)
     y = system.y0 + 0.1 * rng.standard_normal((21, 2 * system.ndof))
@@ -56,7 +56,7 @@ MATRIX = [[0.2, 0.1], [0.1, 0.3]]
 @pytest.mark.parametrize(("damping", "room"), [(0.1, True), ([0.1, 0.3], False), (MATRIX, False), (MATRIX, True)])
 def test_friction_shrinks_vectors(damping, room, monkeypatch):
     monkeypatch.setattr(tangents, "MOST_WRITTEN_OUT", 0 if room else 10**6)
-    monkeypatch.setattr("sympflow.kernels.splittings._CODES", {})
+    monkeypatch.setattr("sympflow.kernels.rollouts._CODES", {})
     system, integrator = coupled(damping=damping), build("chin4c", {})
     code = tangent_code(system, integrator.kicks_and_drifts.level, (), 4, False)
     rows = np.concatenate([system.y0, np.eye(4).reshape(-1)])[None].repeat(3, 0)

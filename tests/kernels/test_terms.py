@@ -5,13 +5,12 @@ from functools import partial
 
 import numpy as np
 import pytest
-import sympy as sp
 from watchdog import watched
 
 from sympflow import HamiltonianSystem, solve
 from sympflow.hamiltonian.parts import linear_and_rest
 from sympflow.kernels import terms
-from sympflow.kernels.array_splittings import ArrayCode, term_code
+from sympflow.kernels.array_splittings import term_code
 from sympflow.kernels.parts_loops import parts_loops
 from sympflow.kernels.protocol import Task, run_states
 from sympflow.kernels.splitting_loops import splitting_loops
@@ -74,30 +73,6 @@ def test_loops_over_terms_are_the_stages_that_are_written_out(kind, compensated,
     assert np.abs(found[0] - found[1]).max() < 1e-12 * np.abs(found[0]).max()
 
 
-@pytest.mark.parametrize("method", ["verlet", "chin4c"])
-@pytest.mark.parametrize(
-    "more",
-    [{}, {"damping": 0.2}, {"damping": [0.1, 0.2, 0.3]}, {"time": "t"}, {"time": "t", "damping": 0.2}],
-    ids=lambda more: " ".join(more) or "alone",
-)
-def test_loops_over_terms_run_as_arrays_do(more, method, monkeypatch):
-    monkeypatch.setattr(terms, "MOST_WRITTEN_OUT", 0)
-    monkeypatch.setattr(terms, "MOST_OPERATIONS", 0)
-    H = SMALL["masses"] + V + (" + q1*cos(3*t) + q2**2*sin(t)" if "time" in more else "")
-    system = HamiltonianSystem.from_sympy(H, y0=[0.3, -0.2, 0.5, 0.1, 0.4, -0.3], **more)
-    y0 = system.y0 + 0.1 * np.random.default_rng(0).standard_normal((9, 6))
-    code = splitting_loops(system).functions(FORCE_GRADIENT if method == "chin4c" else 0, False)
-    assert isinstance(code, ArrayCode)
-    compiled, arrays = (
-        solve(system, method, (0.5, 1.53), y0=y0, dt=0.05, t_eval=[0.7, 1.52], backend=backend)
-        for backend in ("compiled", "array")
-    )
-    np.testing.assert_allclose(compiled.y, arrays.y, rtol=0, atol=1e-13)
-    np.testing.assert_array_equal(
-        solve(system, method, (0.5, 1.53), y0=y0[2], dt=0.05, t_eval=[0.7, 1.52]).y, compiled.y[2]
-    )
-
-
 def test_code_does_not_depend_on_how_many_terms_there_are(monkeypatch):
     texts = set()
     monkeypatch.setattr("sympflow.kernels.runs.compiled", lambda text, *_: texts.add(text))
@@ -107,49 +82,6 @@ def test_code_does_not_depend_on_how_many_terms_there_are(monkeypatch):
         H = HamiltonianSystem.from_sympy(" + ".join([*(f"p{i}**2/2" for i in range(1, n + 1)), *springs]))
         term_code(Splitting(H.symbols, FORCE_GRADIENT)).function("run", 1)
     assert len(texts) == 1
-
-
-def test_terms_that_differ_in_coordinates_and_constants_are_one_family():
-    symbols = SYSTEM.symbols
-    springs, *others = terms.families(symbols.V, symbols.q)
-    sizes = sorted(len(family.coordinates) for family in (springs, *others))
-    assert sizes == [1, 2, 2, SITES - 1, SITES - 1]  # cosine; squares and cubes
-    (masses,) = terms.families(symbols.T, symbols.p)
-    assert masses.coordinates.shape == (SITES, 1)
-
-
-def test_families_add_up():
-    q = sp.symbols("q1:4", real=True)
-    V = sp.sympify(
-        "3*(q1*q2 + q2*q3 - 2*q3**2) + sin(2*q1) - sin(3*q2) + exp(-q3)*q1**3 + Max(q1, 0)",
-        locals={s.name: s for s in q},
-    )
-    total = sp.S.Zero
-    for family in terms.families(V, q):
-        for places, constants in zip(family.coordinates, family.constants, strict=True):
-            values = [*(q[i] for i in places), *map(sp.nsimplify, constants)]
-            total += family.f.xreplace(dict(zip((*family.x, *family.c), values, strict=True)))
-    assert sp.expand(total - V) == 0
-
-
-@pytest.mark.parametrize(
-    ("kinetic", "method"),
-    [
-        ("p{0}**2/2", "srkn14a"),
-        ("p{0}**2/2", "implicit_midpoint"),
-        ("sqrt(1 + p{0}**2)", "verlet"),
-        pytest.param("p{0}**2/2", "log_leapfrog", marks=pytest.mark.slow),
-    ],
-)
-def test_many_degrees_of_freedom_run_compiled(kinetic, method):
-    system = chain(kinetic)
-    single, *others = (
-        solve(system, method, (0, 0.5), y0=y0, dt=0.05, t_eval=[0.3, 0.5], backend=backend)
-        for y0, backend in ((system.y0, "auto"), (np.stack([system.y0 / 2, system.y0]), "auto"), (system.y0, "array"))
-    )
-    assert single.stats["backend"] == "compiled"
-    np.testing.assert_array_equal(others[0].states[1], single.states)
-    np.testing.assert_allclose(single.y, others[1].y, rtol=0, atol=1e-13)
 
 
 def test_the_modes_of_many_degrees_of_freedom_are_arrays():

@@ -82,7 +82,7 @@ def test_bad_arguments_of_escapes():
 def test_a_turning_angle_needs_a_signal():
     """H = p²/2 − cos q turns in T = ∮dq/p, p² = 9 − 4 sin²(q/2): 4 K(4/9)/3, the parameter being k²."""
     run = {"t_span": (0, 300), "y0": [0.0, 3.0]}
-    with pytest.warns(RuntimeWarning, match="`signal`: q1 grows with the time"):
+    with pytest.warns(RuntimeWarning, match="`signal`: q1 grows with time"):
         sympflow.frequencies("p**2/2 - cos(q)", **run)
     found = sympflow.frequencies("p**2/2 - cos(q)", signal=lambda y: np.exp(1j * y[..., :1, :]), **run)
     assert found.frequencies[0, 0] == pytest.approx(2 * np.pi / (4 * ellipk(4 / 9) / 3), abs=1e-8)

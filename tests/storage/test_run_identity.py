@@ -230,9 +230,9 @@ def test_a_store_is_of_one_system_and_what_cannot_be_known_is_vouched_for(tmp_pa
     np.testing.assert_array_equal(run("a", system_of(1.0), resume=True), first)
     for other in (
         system_of(2.0),
-        HamiltonianSystem.from_sympy("p**2/2 + q**2/2", name="custom", y0=[1.0, 0.0], dt=0.1),
+        HamiltonianSystem.from_sympy("p**2/2 + q**2/2", name="V = potential", y0=[1.0, 0.0], dt=0.1),
     ):
-        with pytest.raises(ValueError, match=r"its `system` is custom .*(If the code of `system`|[Nn]ame an)"):
+        with pytest.raises(ValueError, match=r"its `system` is V = potential .*(If the code of `system`|[Nn]ame an)"):
             run("a", other, resume=True)
     held = (threading.Lock(), 1.0)
     whole = run("b", system_of(1.0, held))

@@ -90,16 +90,6 @@ def test_portraits_of_two_degrees_of_freedom_are_sections(method):
     np.testing.assert_allclose(points.get_xydata(), section.states[:, [1, 3]], atol=1e-3)
 
 
-def test_the_portrait_of_a_batch_holds_the_sections_of_its_trajectories():
-    system = systems.henon_heiles()
-    y0 = system.domain.sample(2, 1)
-    report = compare(system, ["verlet"], ["energy"], t_span=(0, 30), y0=y0, n_outputs=40, repeats=1)
-    section = poincare_section(system, "verlet", (0, 30), y0)
-    np.testing.assert_allclose(
-        report.figure("portrait").axes[0].lines[1].get_xydata(), section.states[:, [1, 3]], atol=1e-10
-    )
-
-
 def test_pyplot_is_never_imported_and_comparing_needs_no_matplotlib():
     code = """
 import sys

@@ -79,7 +79,7 @@ def test_registered_scenes_are_known(announced):
     assert systems.get("my_well")(strength=0.5).params == {"strength": 0.5}
     for name, factory, error, message in (
         ("henon-heiles", anharmonic, ValueError, r"^`name` 'henon-heiles' is a built-in scene"),
-        ("anharmonic_well", anharmonic, ValueError, r"^`name` 'anharmonic_well' is that of the plug-in"),
+        ("anharmonic_well", anharmonic, ValueError, r"^`name` 'anharmonic_well' belongs to the plug-in"),
         ("a b", anharmonic, ValueError, r"^`name` must be a word"),
         ("other", needs_an_argument, TypeError, r"^`factory` must be a function that makes the system"),
         ("other", anharmonic(), TypeError, r"^`factory` must be a function that makes the system"),

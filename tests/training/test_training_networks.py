@@ -231,7 +231,7 @@ class TestLabelsAtFewTimes:
         ],
     )
     def test_results_between_them_warn(self, labelled_at_dt, ask):
-        message = r"none is at a time between 0 and 1: what it gives there was compared with nothing"
+        message = r"none of them at a time between 0 and 1: its values there were not compared"
         with pytest.warns(UserWarning, match=message):
             ask(labelled_at_dt, torch.tensor(OSCILLATOR.domain.sample(2)))
 
