@@ -31,6 +31,7 @@ from sympflow.arrays import (
     differentiable,
     finite_states,
     full_of_nan,
+    is_tensor,
     known_finite,
     lanes,
     last,
@@ -461,7 +462,11 @@ def _solved_followed(integrator: Integrator, problem: Problem, action: str, rows
     """The solution of trajectories to whose parameters gradients flow: one run, whatever the values."""
     numbers = {name: as_tensor(value.copy()) for name, value in rows.values.items() if name not in rows.followed}
     followed = {name: rows.followed[name] if name in rows.followed else numbers[name] for name in rows.values}
-    parameter_values = np.array([np.ravel(value) for value in rows.values.values()])
+    letters = None if problem.system.local is None else problem.system.local.letters(followed)
+    if letters is not None:
+        followed = {name: x if is_tensor(x) else as_tensor(np.array(x)) for name, x in letters.items()}
+    columns = [np.broadcast_to(to_numpy(value), rows.shape) for value in followed.values()]
+    parameter_values = np.array([np.ravel(value) for value in columns])
     together = replace(problem, parameter_values=parameter_values, followed=followed, diagnosed=False)
     if problem.system.between_impulses is not problem.system or problem.events is not None or action == "stop":
         raise ValueError(
