@@ -444,7 +444,8 @@ class Search:
         otherwise = "Give more trajectories, say what is known of H, or give the `noise` if it is larger than it looks."
         if self.cut:
             otherwise = f"The time budget ended the search: give it more. {otherwise}"
-        warn(f"{said} {self._hint() or otherwise}")
+        reason = None if deadline.over() else self._hint()
+        warn(f"{said} {reason or otherwise}")
 
     def _hint(self) -> str | None:
         """The likeliest reason why the best model does not explain the data, by slopes."""
