@@ -46,6 +46,8 @@ class ShippedFlow:
         Number of pairs of its processor.
     polynomial : int
         Degree of the polynomials of its kicks, 0 for none.
+    reach : int
+        Steps to either side over which the processor of a flow of planets goes; 0 for other flows.
     cost : float or None
         Of a unit of time, in force evaluations, see `cost_of` in `sympflow.training.shipped.judges`. Outputs are
         not counted.
@@ -69,6 +71,7 @@ class ShippedFlow:
     stages: int | None
     processor: int
     polynomial: int
+    reach: int
     cost: float | None
     energy_error: float | None
     t_end: float | None
@@ -97,6 +100,7 @@ class ShippedFlow:
             stages=None if primed is None else primed["maps"] // 2,
             processor=0 if primed is None else primed.get("processor", 0),
             polynomial=0 if primed is None else max(map(sum, primed.get("monomials", ())), default=0),
+            reach=plan.get("kepler", {}).get("reach", 0),
             energy_error=figures.get("energy_error_95"),
             cost=figures.get("cost"),
             t_end=figures.get("t_end"),
@@ -161,6 +165,7 @@ class ShippedFlows(Sequence[ShippedFlow]):
             architecture = architecture if f.shift is None else "logarithmic, with a clock"
             architecture += f" of degree {f.polynomial}" if f.polynomial else ""
             architecture += f", processor {f.processor}" if f.processor else ""
+            architecture = f"planets, reach {f.reach}" if f.reach else architecture
             until = "" if f.t_end is None else f" (T = {f.t_end:g})"
             yield (
                 f.name,

@@ -62,17 +62,26 @@ class Samples:
     @cached_property
     def jumps(self) -> np.ndarray:
         """The times of the span at which the value jumps, (m,), of a periodic spline its end among them."""
-        lengths = np.diff(self.x)
-        ends = sum(c * lengths ** (len(self.c) - 1 - k) for k, c in enumerate(self.c))
-        starts = self.c[-1]
+        return self._breaks(0)
+
+    @cached_property
+    def kinks(self) -> np.ndarray:
+        """The times at which the value, or its slope, jumps."""
+        return np.union1d(self.jumps, self._breaks(1))
+
+    def _breaks(self, order: int) -> np.ndarray:
+        """The times at which a derivative jumps."""
+        lengths, polynomials = np.diff(self.x), self.polynomials(order)
+        ends = sum(c * lengths ** (len(polynomials) - 1 - k) for k, c in enumerate(polynomials))
+        starts = polynomials[-1]
         large = JUMP * max(np.abs(ends).max(), np.abs(starts).max())
         inner = np.abs(ends[:-1] - starts[1:]) > large
         last = [self.periodic and abs(ends[-1] - starts[0]) > large]
         return self.x[1:][np.concatenate([inner, last])]
 
-    def jump_times(self, low: float, high: float) -> np.ndarray:
-        """The times between two others at which the value jumps, in `MOST_TURNS` periods of a spline at most."""
-        times = self.jumps
+    def jump_times(self, low: float, high: float, kinks: bool = False) -> np.ndarray:
+        """The times between two others of jumps, or `kinks` too, in `MOST_TURNS` periods of a spline at most."""
+        times = self.kinks if kinks else self.jumps
         if self.periodic and len(times):
             start, end = self.span
             first = math.floor((low - start) / (end - start))

@@ -82,7 +82,6 @@ class Hamiltonian:
     """
 
     friction: Friction = FRICTIONLESS
-    autonomous: bool = True
     period: float | None = None
     energy_scale: float | None = None
     followed_mass: Any = None
@@ -105,8 +104,12 @@ class Hamiltonian:
         self.stiffness_matrix: np.ndarray | None = None
         self.functions_given: bool = definition.given
         self.numba_functions: Any = definition.numba_functions
-        self.autonomous = not definition.timed
         self._tested: dict[tuple[type, Any], np.ndarray] = {}  # how far, by the kind of states
+
+    @property
+    def autonomous(self) -> bool:
+        """False if H depends on t."""
+        return not self.definition.timed
 
     @property
     def name(self) -> str:

@@ -66,6 +66,14 @@ class LocalHamiltonian(Definition, ABC):
         other._take({**self.params, **values})
         return other
 
+    def number_columns(self, params: Mapping[str, Any]) -> dict[str, Any]:
+        """Values of parameters, each with one for each trajectory at most."""
+        return dict(params)
+
+    def letters(self, numbers: Mapping[str, Any]) -> dict[str, Any] | None:
+        """The numbers of compiled code through which gradients flow to `numbers` of parameters, if they do."""
+        return None
+
     @abstractmethod
     def _take(self, params: Mapping[str, Any]) -> None:
         """Take values of all parameters, and what follows from them."""
@@ -139,7 +147,8 @@ class LocalHamiltonian(Definition, ABC):
         """∇²V(q), dense: (..., d) to (..., d, d)."""
         d = self.ndof
         self.check_dense(np.prod(q.shape, dtype=float) * d, "∇²V")
-        return self.hessian_vector(q[..., None, :], like(np.eye(d), q) + 0 * q[..., None, :], *t)
+        columns = self.hessian_vector(q[..., None, :], like(np.eye(d), q) + 0 * q[..., None, :], *t)
+        return columns.swapaxes(-1, -2)  # not symmetric where bodies without mass feel others
 
     def check_dense(self, entries: float, what: str) -> None:
         """Refuse a matrix with more than 5e7 entries: ∇²V, or that of the equations of an implicit step."""

@@ -222,9 +222,9 @@ class SymbolicHamiltonian(Definition):
             H = written.xreplace({s: symbols.get(s.name, value) for s, value in values.items()})
             states = {*self.q, *self.p}
             form = self.like(sp.Add(*[term for term in sp.Add.make_args(H) if term.free_symbols & states]))
-            known = {s.name: s for s in values}
-            form.parameters, form.meanings = tuple(symbols.values()), tuple(known[name] for name in names)
-            form.values = tuple(float(values[s]) for s in form.meanings)
+            meanings = [sp.Symbol(name, real=True) for name in names]
+            form.parameters, form.meanings = tuple(symbols.values()), tuple(meanings)
+            form.values = tuple(float(values.get(s, 0.0)) for s in meanings)  # 0 of one that H does not have
             self._named[key] = form
         return self._named[key]
 
@@ -313,7 +313,7 @@ class SymbolicHamiltonian(Definition):
         return [*jumping, *touches(self.H, self.time, self.samples)]
 
     def jump_times(self, low: float, high: float, step: float, kinks: bool = False) -> np.ndarray:
-        found = [samples.jump_times(low, high) for samples in self.samples.values()]
+        found = [samples.jump_times(low, high, kinks) for samples in self.samples.values()]
         found += [each.times(low, high, step, kinks) for each in self._switches]
         times = np.unique(np.concatenate(found)) if found else np.zeros(0)
         return times[np.diff(times, prepend=-np.inf) > 8 * sys.float_info.epsilon * np.abs(times)]

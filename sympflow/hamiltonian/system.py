@@ -837,16 +837,6 @@ class HamiltonianSystem(Hamiltonian, Answering):
         """True if `dt` was not given, and the system has no states from which it could be chosen."""
         return self._dt is None and self._y0 is None and self.domain is None
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Take the state of a pickle, of earlier versions too: they kept `params` as such, and tested no functions."""
-        earlier = {"functions_given": False, "_tested": {}, "_params": Parameters(state.get("params", {}))}
-        earlier |= {f"_{name}": state.get(name) for name in ("dt", "inverse_mass", "name", "y0")}
-        earlier["_scene"] = Scene(**{name: state[name] for name in SCENE if name in state})
-        earlier["local"] = state["definition"] if state["definition"].loops else None
-        now = {name: value for name, value in state.items() if name not in SCENE and f"_{name}" not in earlier}
-        for name, value in {**earlier, **now}.items():
-            super().__setattr__(name, value)
-
     @property
     def params(self) -> Mapping[str, float]:
         """The values of the parameters, read-only, because code is generated from them.

@@ -211,8 +211,7 @@ class Comparison:
         if agree.all():
             return
         i = int(np.argmin(agree))
-        looked = t0 is not None and t0 != times[i] and self.system.autonomous
-        if looked and t0 is not None and (before := _quietly(fun, t0, y)) is not None:
+        if t0 not in (None, times[i]) and (before := _quietly(fun, t0, y)) is not None:
             before = before.reshape(-1, width)[:MOST_ROWS]
             if _agree(before, velocity)[i]:
                 self._refuse_time(t0, times[i], states[i], before[i], slope[i])

@@ -98,7 +98,8 @@ class KeplerCode(Rollouts):
         self.planets = len(frame.order)
         self.jacobi, self.watches = frame.jacobi, frame.encounter is not None
         planets = LANES * self.groups
-        self.room, self.size = 3 * AXES * planets, 3 if form.gradients else 2
+        self.told = 3 * AXES * planets  # numbers that bodies without mass need of the planets, without their rates
+        self.room, self.size = (2 if form.vectors else 1) * self.told, 3 if form.gradients else 2
         table, limits = constants(frame, self.groups)
         self.report = zeros(AXES * (planets + LANES) + 1)
         inside = np.array([frame.inside[group[0]] for group in self.light])
@@ -125,13 +126,17 @@ class KeplerCode(Rollouts):
             for g in range(self.groups)
         ]
         c = [dict(zip(ROWS, rows, strict=True)) for rows in known]
+
+        def moved(vector: Value | None = None) -> None:
+            kick = self._moved(room, c, lengths, vector)
+            if len(self.light):
+                with code.over(len(self.light)) as turn:
+                    self._light(room, turn, kick, lengths[1], c[0]["star"], vector)
+
         if self.form.vectors:
             with code.over(self.form.vectors) as k:
-                self._moved(room, c, lengths, code.at(state, (k + 1) * self.whole))
-        kick = self._moved(room, c, lengths)
-        if len(self.light):
-            with code.over(len(self.light)) as turn:
-                self._light(room, turn, kick, lengths[1], c[0]["star"])
+                moved(code.at(state, (k + 1) * self.whole))
+        moved()
 
     def _moved(
         self, room: Room, c: list[dict[str, Value]], lengths: Sequence[Value], vector: Value | None = None
@@ -175,7 +180,7 @@ class KeplerCode(Rollouts):
             self._write(room, code.at(room.state, NUMBERS * g), state[g], vector, NUMBERS * g)
         return kick
 
-    def _read(self, room: Room, place: Value, vector: Value | None = None, at: int = 0) -> list[Sum]:
+    def _read(self, room: Room, place: Value, vector: Value | None = None, at: Any = 0) -> list[Sum]:
         """The numbers of a group, with their errors, or with those of a vector as rates."""
         code, turns = room.code, [LANES * i for i in range(2 * AXES)]
         found = [code.load(place, i, REGISTER) for i in turns]
@@ -185,7 +190,7 @@ class KeplerCode(Rollouts):
             return [Sum(x, None) for x in found]
         return [Sum(x, code.load(place, self.whole + i, REGISTER)) for x, i in zip(found, turns, strict=True)]
 
-    def _write(self, room: Room, place: Value, group: list[Sum], vector: Value | None = None, at: int = 0) -> None:
+    def _write(self, room: Room, place: Value, group: list[Sum], vector: Value | None = None, at: Any = 0) -> None:
         for i, x in enumerate(group):
             if vector is not None:
                 room.code.store(x.value.rate, vector, at + LANES * i)
@@ -194,49 +199,56 @@ class KeplerCode(Rollouts):
             if x.error is not None:
                 room.code.store(x.error, place, self.whole + LANES * i)
 
-    def _light(self, room: Room, g: Value, kick: Value, drift: Value, star: Value) -> None:
+    def _light(self, room: Room, g: Value, kick: Value, drift: Value, star: Value, vector: Value | None = None) -> None:
         """The same of a group of bodies without mass, which have the same planets inside their orbits."""
-        code, light = room.code, len(self.light)
-        place = code.at(room.state, (g + self.groups) * NUMBERS)
-        state = self._read(room, place)
+        code, light, at = room.code, len(self.light), (g + self.groups) * NUMBERS
+        place = code.at(room.state, at)
+        state = self._read(room, place, vector, at)
         x = values(state[:AXES])
         mu, over, inside = (code.splat(code.load(room.data(3), g + light * i), LANES) for i in range(3))
         inside = code.convert("fptosi", code.lane(inside, 0), "i64")
         planets = LANES * self.groups
 
-        def vector(which: int, j: Any) -> Vectors:
-            start = AXES * planets * which
-            return [code.splat(code.load(room.work, j + (start + planets * i)), LANES) for i in range(AXES)]
+        def told(which: int, j: Any) -> Vectors:
+            """One of the three vectors of a planet, in all lanes."""
+            starts = [planets * (AXES * which + i) for i in range(AXES)]
+            found, *rates = (
+                [code.splat(code.load(room.work, j + (start + more)), LANES) for start in starts]
+                for more in ([0] if vector is None else [0, self.told])
+            )
+            return [Dual(y, z) for y, z in zip(found, *rates, strict=True)] if rates else found
 
         def jumped(which: int) -> None:
-            for y, change in zip(state, vector(which, code.constant(0, INT)), strict=False):
+            for y, change in zip(state, told(which, code.constant(0, INT)), strict=False):
                 y.add(change)
 
         if self.jacobi:
-            h = [y + p for y, p in zip(x, vector(1, inside), strict=True)]
+            h = [y + p for y, p in zip(x, told(1, inside), strict=True)]
             square, over_r = dot(h, h), 1.0 / sqrt(dot(x, x))
             pull, own = star / (square * sqrt(square)), mu * over_r * over_r * over_r
-            a = [over * p - pull * y + own * z for p, y, z in zip(vector(2, inside), h, x, strict=True)]
+            a = [over * p - pull * y + own * z for p, y, z in zip(told(2, inside), h, x, strict=True)]
         else:
             jumped(1)
             h = values(state[:AXES])
-            a = [code.constant(0.0, REGISTER)] * AXES
+            zero = code.constant(0.0, REGISTER)
+            a = [zero if vector is None else Dual(zero, zero)] * AXES
         a = self._with_extra(room, a, h)
 
         def added(j: Value, total: list[Value]) -> list[Value]:
-            d = [p - y for p, y in zip(vector(0, j), h, strict=True)]
+            d = [p - y for p, y in zip(told(0, j), h, strict=True)]
             distance = dot(d, d)
             place = j + (j >> LANES_SHIFT) * (LANES * (len(ROWS) - 1))  # of G m in the table
             w = code.splat(code.load(room.data(0), place), LANES) / (distance * sqrt(distance))
-            limit = code.splat(code.load(room.data(4), j), LANES)
-            return [
-                code.apply("min", (total[0], distance - limit)),
-                *(p + w * q for p, q in zip(total[1:], d, strict=True)),
-            ]
+            near, changes = total[0], parts_of([w * q for q in d])
+            if vector is None:
+                limit = code.splat(code.load(room.data(4), j), LANES)
+                near = code.apply("min", (near, distance - limit))
+            return [near, *(p + q for p, q in zip(total[1:], changes, strict=True))]
 
         start = code.splat(code.constant(float("inf")), LANES)
-        near, *a = code.loop(self.planets, [start, *a], added)
-        if self.watches:
+        near, *sums = code.loop(self.planets, [start, *parts_of(a)], added)
+        a = sums if vector is None else [Dual(y, z) for y, z in zip(sums[:AXES], sums[AXES:], strict=True)]
+        if self.watches and vector is None:
             kick = kick + self._met(room, code.any(near < 0.0), [h], kick, g)
         for i in range(AXES):
             state[AXES + i].add(kick * a[i])
@@ -246,7 +258,7 @@ class KeplerCode(Rollouts):
         r = sqrt(dot(x, x))
         for y, change in zip(state, drifted(x, values(state[AXES:]), mu, drift, r, 1.0 / r), strict=True):
             y.add(change)
-        self._write(room, place, state)
+        self._write(room, place, state, vector, at)
 
     def _with_extra(self, room: Room, a: Vectors, h: Vectors) -> Vectors:
         """Accelerations of bodies at places h from the star, with those by the extra potential."""
@@ -317,8 +329,9 @@ class KeplerCode(Rollouts):
 
     def _tell(self, room: Room, vector: Vectors, which: int, g: int) -> None:
         """Write down one of three vectors of a group of planets, for the bodies without mass."""
-        for i, value in enumerate(vector):
-            room.code.store(value, room.work, LANES * (self.groups * (AXES * which + i) + g))
+        for i, value in enumerate(parts_of(vector)):
+            start = self.told * (i // AXES) + LANES * (self.groups * (AXES * which + i % AXES) + g)
+            room.code.store(value, room.work, start)
 
     def _heliocentric(self, x: list[Vectors], c: list[dict[str, Value]]) -> list[Vectors]:
         """Places as seen from the star, of those from the centre of all inside."""
@@ -350,12 +363,16 @@ class KeplerCode(Rollouts):
         """Divide vectors by the power of two next to their lengths, whose exponents are added up."""
         code, count = room.code, self.form.vectors
         with code.over(count) as k:
-            place, last = code.at(room.state, (k + 1) * self.whole), (count + 1) * self.whole + k
-            w = [code.load(place, LANES * i, REGISTER) for i in range(self.whole // LANES)]
-            sizes = [abs(y) for y in w]
-            n, factor = exponent_of(code.total(sum(sizes[1:], sizes[0])))
-            for i, y in enumerate(w):
-                code.store(y * code.splat(factor, LANES), place, LANES * i)
+            vector, last = code.at(room.state, (k + 1) * self.whole), (count + 1) * self.whole + k
+            registers = self.whole // LANES
+
+            def grown(i: Value, total: list[Value]) -> list[Value]:
+                return [total[0] + abs(code.load(vector, LANES * i, REGISTER))]
+
+            (size,) = code.loop(registers, [code.constant(0.0, REGISTER)], grown)
+            n, factor = exponent_of(code.total(size))
+            with code.over(registers) as i:
+                code.store(code.load(vector, LANES * i, REGISTER) * code.splat(factor, LANES), vector, LANES * i)
             code.store(code.load(room.state, last) + n, room.state, last)
 
     def _met(self, room: Room, met: Value, h: list[Vectors], like: Value, light: Value | None = None) -> Value:
@@ -383,6 +400,11 @@ def sqrt(x: Any) -> Any:
 
 def values(sums: Sequence[Sum]) -> Vectors:
     return [x.value for x in sums]
+
+
+def parts_of(x: Vectors) -> list[Value]:
+    """The values of numbers and then, of dual ones, their rates."""
+    return [*(y.value for y in x), *(y.rate for y in x)] if isinstance(x[0], Dual) else x
 
 
 def of_lanes(function: Callable[[Value], Value], x: Any) -> Any:
@@ -525,10 +547,10 @@ class KeplerLoops:
 
     def code(self, form: Form) -> KeplerCode:
         """The compiled functions of a form, made once; NotCompiled says why there are none."""
-        if self._light and (form.vectors or form.gradients):
+        if self._light and form.gradients:
             raise NotCompiled(
-                "`system` has bodies without mass, and compiled deviation vectors and force gradients are for bodies "
-                "with mass: use backend='array'."
+                "`system` has bodies without mass, and compiled force gradients are for bodies with mass: use "
+                "backend='array'."
             )
         return self._made(form, 0, 1)
 

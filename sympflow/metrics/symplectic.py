@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 from sympflow.arguments import check_counts, warn
 from sympflow.arrays import jvp, to_numpy
 from sympflow.hamiltonian.scales import MOST_DENSE, natural_scale
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.metrics.energy import failed
 from sympflow.solution import Solution, check_solution, gathered
 
@@ -112,7 +113,9 @@ def symplecticity_defect(
     The Jacobian A is taken in the variables (s q, p/s), which keep the form J and remove the imbalance of a stiff
     oscillator, or of units. The defect is inf for a trajectory that became non-finite or could not be continued. Of
     lattices and pairs of more than 200 degrees of freedom it is the value of `symplecticity_estimate`, which says the
-    error too, unless it is to be `relative` or a `scale` is given.
+    error too, unless it is to be `relative` or a `scale` is given. Bodies without mass have a form of their own, with
+    momenta per unit mass, which is kept for given motions of the others: their rates by those of the others are left
+    out.
 
     Parameters
     ----------
@@ -184,6 +187,7 @@ def symplecticity_estimate(sol: Solution, directions: int = 8, seed: int = 0) ->
     system, integrator = sol.system, sol.integrator
     d = system.ndof
     U = torch.from_numpy(np.random.default_rng(seed).standard_normal((directions, 2 * d)))
+    felt = _felt(system, d)
     i, j = np.triu_indices(directions, 1)
     worst, error = np.zeros(sol.y.shape[:-2]), np.zeros(sol.y.shape[:-2])
     for times, states, lengths in integrator.steps(system, sol.t_span, sol.y0):
@@ -194,7 +198,12 @@ def symplecticity_estimate(sol: Solution, directions: int = 8, seed: int = 0) ->
             def one_step(z: Any, t: float = t, step: Any = step) -> Any:
                 return integrator.step(system, t, z, step)
 
-            moved = [to_numpy(jvp(one_step, x, v.expand_as(x))[1]) for v in u]
+            def along(v: Any, x: Any = x, one_step: Any = one_step) -> np.ndarray:
+                return to_numpy(jvp(one_step, x, v.expand_as(x))[1])
+
+            moved = [along(v) for v in u]
+            if not felt.all():
+                moved = [w - ~felt * along(v * torch.from_numpy(felt)) for v, w in zip(u, moved, strict=True)]
             before = _form(u.numpy()[i], u.numpy()[j]).reshape(-1, *[1] * (y.ndim - 1))
             squares = (_form(np.stack(moved)[i], np.stack(moved)[j]) - before).astype(float) ** 2 / (2 * d)
             mean = np.where(np.isfinite(squares).all(0), squares.mean(0), np.inf)
@@ -261,10 +270,12 @@ def _form_defect(sol: Solution, rate: float, relative: bool, scale: ArrayLike | 
     worst = np.zeros(sol.y.shape[:-2])
     for _, h, A in step_tangents(sol):
         n = A.shape[-1] // 2
+        felt = _felt(sol.system, n)
+        B = np.where(felt[:, None] | ~felt, A, 0.0)
         weights = np.concatenate([np.tile(s, n // d), np.tile(1 / s, n // d)])
         J = np.block([[np.zeros((n, n)), np.eye(n)], [-np.eye(n), np.zeros((n, n))]])
         with np.errstate(all="ignore"):
-            scaled = weights[:, None] * A / weights
+            scaled = weights[:, None] * B / weights
             finite = np.isfinite(scaled).all((-2, -1))
             scaled = np.where(finite[..., None, None], scaled, 0.0)
             kept = J if rate == 0 else np.exp(-rate * h)[..., None, None] * J
@@ -275,6 +286,12 @@ def _form_defect(sol: Solution, rate: float, relative: bool, scale: ArrayLike | 
                 defect /= np.linalg.norm(scaled, 2, axis=(-2, -1)) ** 2
         worst = np.maximum(worst, np.where(finite, defect, np.inf).max(0))
     return np.where(failed(sol), np.inf, worst)[()]
+
+
+def _felt(system: HamiltonianSystem, n: int) -> np.ndarray:
+    """False of the numbers (2n,) of bodies without mass, which no other one feels."""
+    felt = None if system.local is None else system.local.felt
+    return np.ones(2 * n, dtype=bool) if felt is None else np.tile(felt > 0, 2 * n // len(felt))
 
 
 def _factors(scale: ArrayLike, d: int) -> np.ndarray:

@@ -301,6 +301,11 @@ def outer_solar_system() -> HamiltonianSystem:
     )
 
 
+def digits(x: np.ndarray) -> np.ndarray:
+    """Numbers with five digits: a domain is kept in the files of flows."""
+    return np.vectorize(lambda number: float(f"{number:.5g}"))(x)
+
+
 def _tube(q: np.ndarray, v: np.ndarray) -> Tube:
     """Around the path of each body, found by leapfrog: it is off by far less than the thickness."""
     h, n = 100.0, int(_PERIOD / 100)
@@ -317,5 +322,4 @@ def _tube(q: np.ndarray, v: np.ndarray) -> Tube:
     size = np.sqrt((orbit**2).sum(-1).mean(0))  # (2, body)
     radius = np.repeat(np.where(np.arange(6) == 0, 1.0, _THICKNESS) * size, 3)
     groups = [[*range(3 * i, 3 * i + 3), *range(18 + 3 * i, 21 + 3 * i)] for i in range(6)]
-    digits = np.vectorize(lambda x: float(f"{x:.5g}"))  # a domain is kept in the files of flows
     return Tube(digits(orbit.reshape(len(orbit), 36)), digits(radius), groups)

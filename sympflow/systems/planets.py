@@ -8,6 +8,7 @@ import numpy as np
 
 from sympflow.hamiltonian.domain import Tube
 from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.systems.celestial import digits
 
 PLANETS = ("Mercury", "Venus", "Earth", "Mars", "Jupiter", "Saturn", "Uranus", "Neptune")
 UNITS = "AU", "day", "solar mass"
@@ -16,19 +17,20 @@ SUN_OVER_PLANET = np.array(  # the Sun's mass over that of each planet with its 
     [6_023_600.0, 408_523.71, 328_900.561400, 3_098_708.0, 1047.3486, 3497.898, 22_902.98, 19_412.24]
 )
 
-TABLE = np.array(
-    [  # a in AU, e, inclination, mean longitude, longitude of the perihelion, longitude of the node in degrees
-        [0.38709927, 0.20563593, 7.00497902, 252.25032350, 77.45779628, 48.33076593],
-        [0.72333566, 0.00677672, 3.39467605, 181.97909950, 131.60246718, 76.67984255],
-        [1.00000261, 0.01671123, -0.00001531, 100.46457166, 102.93768193, 0.0],
-        [1.52371034, 0.09339410, 1.84969142, -4.55343205, -23.94362959, 49.55953891],
-        [5.20288700, 0.04838624, 1.30439695, 34.39644051, 14.72847983, 100.47390909],
-        [9.53667594, 0.05386179, 2.48599187, 49.95424423, 92.59887831, 113.66242448],
-        [19.18916464, 0.04725744, 0.77263783, 313.23810451, 170.95427630, 74.01692503],
-        [30.06992276, 0.00859048, 1.77004347, -55.12002969, 44.96476227, 131.78422574],
+STATES = np.array(
+    [  # x, y, z in AU and their rates in AU a day, as seen from the Sun
+        [-0.1300936030, -0.4472876191, -0.0245983102, 0.021366395652, -0.006447989486, -0.002487863990],
+        [-0.7183022959, -0.0326543101, 0.0410141875, 0.000798117567, -0.020295218704, -0.000323451390],
+        [-0.1771587879, 0.9672193518, -0.0000011464, -0.017203109043, -0.003163911925, 0.000000024316],
+        [1.3907159218, -0.0134163141, -0.0344676652, 0.000671499474, 0.015187248095, 0.000301651653],
+        [4.0011768812, 2.9385763339, -0.1017852686, -0.004568313982, 0.006443205813, 0.000075579673],
+        [6.4064113390, 6.5699899336, -0.3690746350, -0.004292350203, 0.003890315850, 0.000102947967],
+        [14.4318595982, -13.7343123910, -0.2381371059, 0.002678104817, 0.002672697133, -0.000024771979],
+        [16.8120559831, -24.9917701761, 0.1272291482, 0.002579275595, 0.001776898889, -0.000095908896],
     ]
 )
-"""At J2000.0, in the mean ecliptic and equinox of it; the Earth's row is the barycentre of Earth and Moon."""
+"""Of DE405 at J2000.0, JD 2451545.0, in the mean ecliptic and equinox of it, which the equator meets at 84381.448″; the
+Earth's row is the barycentre of Earth and Moon, other rows those of planets with their moons."""
 
 _PHASES = 60  # of each planet's own path in the tube
 _THICKNESS = 0.2  # of the tube, relative to each planet's distance and speed
@@ -47,21 +49,21 @@ def solar_system(planets: int | Sequence[str] = 8) -> HamiltonianSystem:
 
     Notes
     -----
-    Known truths: the total momentum is 0 and the angular momentum constant; the periods are 88.0, 224.7, 365.3, 687,
-    4333, 10 759, 30 685 and 60 189 days. The planets' elements are mean ones that fit their positions from 1800 to 2050
-    to some hundred thousandths of a radian, not the osculating ones of an ephemeris; there is neither relativity nor
-    the Moon.
+    Known truths: the total momentum is 0 and the angular momentum constant; the mean periods are 88.0, 224.7, 365.3,
+    687, 4333, 10 759, 30 685 and 60 189 days. There is neither relativity nor the Moon; with relativity as the `extra`
+    of `HamiltonianSystem.planets` the secular frequencies of the outer planets are those of [2]_ to four digits.
 
     The domain is a `Tube` about the ellipses. The default interval is 1,000 years, the default step a twentieth of the
     shortest period.
 
     References
     ----------
-    .. [1] E. M. Standish, "Keplerian elements for approximate positions of the major planets", Solar System Dynamics
-       Group, Jet Propulsion Laboratory, table 1.
-    .. [2] E. M. Standish, "JPL planetary and lunar ephemerides, DE405/LE405", JPL Interoffice Memorandum 312.F-98-048,
-       1998: masses.
+    .. [1] E. M. Standish, "JPL planetary and lunar ephemerides, DE405/LE405", JPL Interoffice Memorandum 312.F-98-048,
+       1998: states and masses.
+    .. [2] J. Laskar and others, "A long-term numerical solution for the insolation quantities of the Earth", Astron.
+       Astrophys. 428 (2004) 261–285.
     """
+    from sympflow.hamiltonian.kepler import elements_of
     from sympflow.hamiltonian.planets import gravity, placed
 
     names: Sequence[str] = ()
@@ -73,11 +75,10 @@ def solar_system(planets: int | Sequence[str] = 8) -> HamiltonianSystem:
         raise ValueError(f"`planets` must be a number from 1 to 8, or names of {', '.join(PLANETS)}; got {planets!r}.")
     rows = [PLANETS.index(name) for name in names]
     masses = np.concatenate([[1.0], 1 / SUN_OVER_PLANET[rows]])
-    a, e, *angles = TABLE[rows].T
-    inclination, longitude, perihelion, node = np.radians(angles)
-    elements = np.stack([a, e, inclination, node, perihelion - node, longitude - perihelion], axis=-1)
-    elements[:, 2:] = np.where(np.arange(4) > 0, np.mod(elements[:, 2:], 2 * np.pi), elements[:, 2:])
-    G, phases = gravity(UNITS), np.repeat(elements[None], _PHASES, axis=0)
+    G = gravity(UNITS)
+    x, v = np.split(STATES[rows], 2, axis=-1)
+    elements = elements_of(x, v, G * (1 + masses[1:]))
+    phases = np.repeat(elements[None], _PHASES, axis=0)
     phases[..., 5] += np.linspace(0, 2 * np.pi, _PHASES, endpoint=False)[:, None]
     orbit = placed(masses, G, phases)
     n = len(masses)
@@ -89,6 +90,6 @@ def solar_system(planets: int | Sequence[str] = 8) -> HamiltonianSystem:
         elements=elements,
         units=UNITS,
         name="solar_system",
-        domain=Tube(orbit, np.repeat(_THICKNESS * size, 3), groups),
+        domain=Tube(digits(orbit), digits(np.repeat(_THICKNESS * size, 3)), groups),
         t_span=(0.0, 365_250.0),
     )

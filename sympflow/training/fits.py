@@ -575,7 +575,7 @@ class KeplerFit(Fit):
     Parameters
     ----------
     dt : float, optional
-        Δt; by default the longest with an error of at most `tol`, of those up to a tenth of the shortest period.
+        Δt; by default the longest with an error of at most `tol`, of those up to a quarter of the shortest period.
     tol : float
         Relative energy error, where `dt` is left out.
     reach, gradients : int

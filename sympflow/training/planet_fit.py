@@ -29,7 +29,7 @@ from sympflow.training.session import Session
 LINEAR_STEPS, WEIGHTED_STEPS = 3, 6
 CUTOFF = 1e-9, 1e-5  # of singular values, without and with force gradients
 FEW = 3  # points for each number, of a trial
-LONGEST, SHORTEST, RATIO = 1 / 10, 1 / 100, 1.002  # steps that are tried, parts of the shortest period; their spacing
+LONGEST, SHORTEST, RATIO = 1 / 4, 1 / 100, 1.002  # steps that are tried, parts of the shortest period; their spacing
 HOPE = 20.0  # error of a standard corrector, in units of the tolerance, from which a trained one may reach it
 LOOKS = 300  # at the energy, to find that
 TRIAL_ORBITS = 2000

@@ -23,7 +23,7 @@ import torch
 
 from sympflow.training.shipped.recipe import Recipe, made
 
-KINDS = ("sympflow", "mlp", "primed", "split")
+KINDS = ("sympflow", "mlp", "primed", "split", "kepler")
 
 
 def package_folder() -> Path:

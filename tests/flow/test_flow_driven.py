@@ -161,7 +161,7 @@ def test_bad_times(system, flow):
     with pytest.raises(ValueError, match=r"^`t0` of shape \(3,\) does not fit"):
         flow(1.0, x, torch.zeros(3))
     aperiodic = driven(period=None)
-    with pytest.raises(TypeError, match=r"^`x` is torch.float32, in which times are rounded"):
+    with pytest.raises(TypeError, match=r"^`x` is torch.float32, which rounds times"):
         flow.transferred(aperiodic).to(torch.float32)(1.0, x.float(), 1e6)
 
 

@@ -408,17 +408,6 @@ class TestParameters:
             made("p**2/2 + q**2/2", **scene)
 
 
-def test_a_pickle_of_a_version_that_tested_no_functions_is_read():
-    system = systems.fput(m=1, omega=10.0)
-    state = {k: v for k, v in vars(system).items() if k not in ("functions_given", "_checked", "_params")}
-    old = HamiltonianSystem.__new__(HamiltonianSystem)
-    old.__setstate__({**state, "params": {"omega": 10.0}})
-    assert old.params == system.params
-    assert old.fingerprint == system.fingerprint
-    old.check_functions()
-    np.testing.assert_array_equal(pickle.loads(pickle.dumps(old)).force(old.y0[:2]), system.force(old.y0[:2]))
-
-
 def test_long_sums_are_evaluated_in_pieces(monkeypatch):
     monkeypatch.setattr("sympflow.hamiltonian.symbolic.LONGEST_SUM", 3)
     system = made("p**2/2 + " + " + ".join(f"q**2/(q + {k})" for k in range(1, 9)))

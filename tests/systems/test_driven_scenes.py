@@ -108,7 +108,7 @@ def test_adaptive_methods_do_not_step_over_a_quadrupole():
     for method in ("dop853", "rk45", "dopri5"):
         sol = solve(system, method, (0, system.period), [1.0, 0, 0, 0], t_eval=[system.period], rtol=1e-6)
         assert np.abs(sol.y[[0, 2], -1] - exact[0, :, 0]).max() < 0.01
-    with pytest.raises(ValueError, match=r"^`sol` is of 'fodo_cell', of which H jumps .* use sympflow.reference_error"):
+    with pytest.raises(ValueError, match=r"^`sol` is of 'fodo_cell', whose H jumps .* use sympflow.reference_error"):
         energy_balance_error(sol)
 
 

@@ -13,15 +13,15 @@ SMALL = {"reach": 16, "points": 400, "orbits": 5000}
 
 @pytest.fixture(scope="module")
 def flow():
-    return train(OUTER, KeplerFit(222.0, **SMALL))
+    return train(OUTER, KeplerFit(228.0, **SMALL))
 
 
 def test_trained_coordinates_are_better_than_standard_ones(flow, tmp_path):
     """Over ten times as long as it was trained for; a step is the same, a kick and a drift."""
     given = {"t_span": (0, 3e7), "save_every": 100, "on_domain_exit": "ignore"}
     trained = solve(OUTER, flow, **given)
-    with pytest.warns(RuntimeWarning, match="`dt` 222 is long for method 'wisdom_holman'"):
-        standard = solve(OUTER, "wisdom_holman", dt=222.0, corrector=17, **given)
+    with pytest.warns(RuntimeWarning, match="`dt` 228 is long for method 'wisdom_holman'"):
+        standard = solve(OUTER, "wisdom_holman", dt=228.0, corrector=17, **given)
     error, of_standard = (np.abs(sol.energy_error()).max() for sol in (trained, standard))
     assert error < 0.75 * of_standard
     assert error < 1.5 * flow.figures["energy_error"]
@@ -31,11 +31,11 @@ def test_trained_coordinates_are_better_than_standard_ones(flow, tmp_path):
 
 
 def test_times_between_steps_are_near_the_exact_solution(flow):
-    t = np.array([0.0, 100.0, 222.0, 500.0])
+    t = np.array([0.0, 100.0, 228.0, 500.0])
     y = solve(OUTER, flow, (0, 500.0), t_eval=t).y
     right = solve(OUTER, "dop853", (0, 500.0), t_eval=t, rtol=1e-13, atol=1e-16).y
     assert np.abs(y - right)[:, 1].max() < 1e-12
-    assert np.abs(y - right).max() < 1e-7  # Wisdom's and Holman's step of 222 days alone misses by 1e-5
+    assert np.abs(y - right).max() < 1e-7  # Wisdom's and Holman's step of 228 days alone misses by 1e-5
 
 
 def test_a_tolerance_chooses_the_step(capsys):
@@ -44,7 +44,7 @@ def test_a_tolerance_chooses_the_step(capsys):
     flow = train(system, tol=1e-6, reach=4, points=100, gradients=0, orbits=300.0, progress=True)
     assert f"Δt {flow.dt:.4g}" in capsys.readouterr().err
     assert flow.figures["energy_error"] <= 1e-6
-    assert 2 * np.pi / 100 < flow.dt <= 2 * np.pi / 10 * 1.001
+    assert 2 * np.pi / 100 < flow.dt <= 2 * np.pi / 4 * 1.001
 
 
 def test_where_it_does_not_hold(flow):

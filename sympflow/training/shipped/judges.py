@@ -13,6 +13,7 @@ import torch
 from sympflow.flow.certificate import upper_limit
 from sympflow.flow.clocked import ClockedFlow
 from sympflow.flow.flow_map import FlowMap
+from sympflow.flow.planetary import KeplerFlow
 from sympflow.flow.primed import PrimedFlow
 from sympflow.flow.split import SplitFlow
 from sympflow.hamiltonian.exact_flow import reference_step
@@ -33,6 +34,7 @@ RUNS_SEED = 1_000_003  # of the held-out states of flows without a certificate
 
 OF_A_GRADIENT, OF_A_CURVATURE, OF_A_MONOMIAL, OF_A_PARAMETER = 0.3, 0.4, 0.05, 0.4  # forces
 OF_A_LOGARITHM = 2.0  # forces: a kick and a drift of the logarithmic Hamiltonian, a division in each
+OF_AN_ORBIT = 1.0  # forces: Kepler's drift of all planets
 
 
 def cost_of(flow: Any) -> float:
@@ -43,6 +45,8 @@ def cost_of(flow: Any) -> float:
     """
     if isinstance(flow, ClockedFlow):
         return OF_A_LOGARITHM * flow.scheme.force_evaluations / flow.figures["step"]
+    if isinstance(flow, KeplerFlow):
+        return (1.0 + OF_AN_ORBIT) / flow.dt
     if isinstance(flow, PrimedFlow):
         kernel = flow.kernel_scheme()
         beside = OF_A_GRADIENT * kernel.hessian_evaluations + OF_A_CURVATURE * kernel.curvature_evaluations

@@ -17,6 +17,7 @@ from sympflow.flow.clocked import ClockedFlow
 from sympflow.flow.files import load
 from sympflow.flow.flow_map import FlowMap
 from sympflow.flow.mlp import MLPFlow
+from sympflow.flow.planetary import KeplerFlow
 from sympflow.flow.primed import PrimedFlow
 from sympflow.flow.split import SplitFlow
 from sympflow.hamiltonian.domain import Domain, EnergySublevel
@@ -24,12 +25,40 @@ from sympflow.hamiltonian.fingerprint import Identity
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.time_transformation import time_transformed
 from sympflow.solver import solve
-from sympflow.systems import SYSTEMS, duffing, fput, harmonic_oscillator, phi4, sine_gordon, spring_pendulum
+from sympflow.systems import (
+    SYSTEMS,
+    duffing,
+    fput,
+    harmonic_oscillator,
+    phi4,
+    sine_gordon,
+    solar_system,
+    spring_pendulum,
+)
 from sympflow.training import fits
 from sympflow.training.clock_fit import train_clock
-from sympflow.training.fits import ClockedFit, Fit, GaussNewton, LossFit, NetworkFit, PrimedFit, Solver, SplitFit
+from sympflow.training.fits import (
+    ClockedFit,
+    Fit,
+    GaussNewton,
+    KeplerFit,
+    LossFit,
+    NetworkFit,
+    PrimedFit,
+    Solver,
+    SplitFit,
+)
+from sympflow.training.planet_fit import can_train, train_planets
 from sympflow.training.session import Session
-from sympflow.training.shipped.judges import AsPublished, ByRuns, Judge, balance_errors, by_certificate, of_stiff
+from sympflow.training.shipped.judges import (
+    AsPublished,
+    ByRuns,
+    Judge,
+    balance_errors,
+    by_certificate,
+    of_stiff,
+    one_step_errors,
+)
 from sympflow.training.trainer import fit_flow
 from sympflow.workers import WorkerPool
 
@@ -50,6 +79,7 @@ SCENES: dict[str, Callable[[], HamiltonianSystem]] = {
     "phi4_sheet": partial(
         HamiltonianSystem.lattice, onsite="(q**2 - 1)**2/4", bond="r**2/2", shape=(16, 16), name="phi4_sheet"
     ),
+    "outer_planets": partial(solar_system, ("Jupiter", "Saturn", "Uranus", "Neptune")),
     "fput_50": partial(fput, omega=50.0),
     "fput_1000": partial(fput, omega=1000.0),
     "spring_pendulum_1e6": partial(spring_pendulum, 1e6, coordinates="polar"),
@@ -103,7 +133,7 @@ class Recipe:
     @property
     def kind(self) -> str:
         """The kind of flow, by which the command chooses."""
-        kinds: dict[Any, str] = {PrimedFlow: "primed", ClockedFlow: "primed", SplitFlow: "split"}
+        kinds: dict[Any, str] = {PrimedFlow: "primed", ClockedFlow: "primed", SplitFlow: "split", KeplerFlow: "kepler"}
         return kinds.get(type(self.flow), self.flow.kind)
 
     @property
@@ -151,6 +181,8 @@ class Recipe:
                 "scheme": flow.scheme.name,
                 "terms": len(flow.clock.numbers),
             }
+        if isinstance(flow, KeplerFlow):
+            return KeplerFit, {"dt": flow.dt, "reach": len(flow.kicks) // 2, "gradients": len(flow.gradients)}
         if isinstance(flow, MLPFlow):
             return NetworkFit, {"dt": flow.dt, "baseline": True}
         hidden = flow.layers[0].potential.hidden
@@ -165,6 +197,8 @@ class Recipe:
             return ByRuns()
         if isinstance(flow, SplitFlow):
             return of_stiff
+        if isinstance(flow, KeplerFlow):
+            return of_planets
         if not isinstance(flow, PrimedFlow):
             return AsPublished(*INITIAL[scene]) if scene in INITIAL else by_certificate
         if scene == "outer_solar_system":
@@ -182,6 +216,8 @@ class Recipe:
         (fit, solver), *further = self.stages
         if isinstance(fit, ClockedFit):
             return train_clock(system, fit, self.domain)
+        if isinstance(fit, KeplerFit):
+            return train_planets(system, fit, self.domain, Session(progress=progress))
         flow = None
         if not isinstance(fit, NetworkFit):
             earlier = EARLIER.get(self.name)
@@ -228,9 +264,19 @@ def _made(progress: bool | None, path: Path) -> FlowMap:
 
 
 def along_the_orbit(system: HamiltonianSystem, n: int = 10, span: float = 1e5 * YEAR, seed: int = 0) -> np.ndarray:
-    """States of the outer solar system at n random times in 1e5 years of its own orbit, which stays in Ω."""
+    """States of planets at n random times in 1e5 years of their own orbit, which stays in Ω."""
     t = np.sort(np.random.default_rng(seed).uniform(0, span, n))
-    return solve(system, "kahan_li8", (0.0, float(t[-1])), dt=200.0, t_eval=t).states
+    given: dict[str, Any] = {"method": "kahan_li8", "dt": 200.0}
+    if can_train(system):
+        given = {"method": "kepler_aba1064"}
+    return solve(system, t_span=(0.0, float(t[-1])), t_eval=t, **given).states
+
+
+def of_planets(flow: Any, system: HamiltonianSystem) -> None:
+    """Errors of runs over 1e5 years from states along the orbit, and of steps from these."""
+    ByRuns(states=along_the_orbit, t_end=1e5 * YEAR)(flow, system)
+    at_end, between = one_step_errors(flow, system, along_the_orbit(system))
+    flow.figures |= {"one_step_error": at_end, "fractional_error": between}
 
 
 def _square(omega: float = 1.0) -> np.ndarray:
