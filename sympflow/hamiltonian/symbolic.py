@@ -929,7 +929,7 @@ def _hessian_by_program(
     try:
         program = recorded(f, variables)
     except NotCompiled:
-        return generate(list(hessian(f, variables[:n])), variables, library)
+        return generate([printable(entry) for entry in hessian(f, variables[:n])], variables, library)
     x = program.inputs[:n]
     rows = [slopes(s, x[: i + 1]) for i, s in enumerate(slopes(program.outputs[0], x))]
     return Program(program.inputs, [rows[max(i, j)][min(i, j)] for i in range(n) for j in range(n)])
