@@ -50,6 +50,11 @@ def field(t, y, _):
 """
 DOPRI = """diffrax.diffeqsolve(diffrax.ODETerm(field), diffrax.Dopri8(), 0.0, 10.0, 0.1,
                     jnp.array([0.1, 0.1, 0.2, 0.1])).ys.block_until_ready()"""
+CHAIN = """T = "+".join(f"p{i}**2/2" for i in range(1, 65))
+V = "+".join(f"(q{i + 1}-q{i})**2/2 + (q{i + 1}-q{i})**4/4" for i in range(1, 64))
+system = HamiltonianSystem.from_sympy(f"{T} + {V}", y0=[*np.linspace(0, 1, 64), *np.zeros(64)])"""
+BODIES = """y0 = [1, 0, -1, 0, 0, 0.5, 0, 0.4, 0, -0.4, 0.3, 0.0]
+system = HamiltonianSystem.pairs("-1/r", y0=y0, masses=[1, 1, 1], dim=2)"""
 BATCH = "y0=system.y0 + 0.01*np.random.default_rng(0).normal(size=(1000, 4))"
 
 CASES = {
@@ -79,6 +84,22 @@ CASES = {
         SOLVE + "system = systems.henon_heiles()",
         "solve(system, 'gauss_legendre4', (0, 10))",
     ),
+    "`lyapunov`, Hénon–Heiles": (
+        "sympflow",
+        SOLVE + "from sympflow import lyapunov\nsystem = systems.henon_heiles()",
+        "lyapunov(system, 'verlet', t_span=(0, 100))",
+    ),
+    "three bodies by `pairs`": (
+        "sympflow",
+        SOLVE + BODIES,
+        "solve(system, 'verlet', (0, 1), dt=0.01)",
+    ),
+    "a lattice of 256 sites": (
+        "sympflow",
+        SOLVE + "system = systems.fput_beta(256)",
+        "solve(system, 'verlet', (0, 10), dt=0.05)",
+    ),
+    "64 degrees of freedom as text": ("sympflow", SOLVE + CHAIN, "solve(system, 'verlet', (0, 10), dt=0.05)"),
     "Hénon–Heiles, DOP853": ("scipy", SCIPY, "solve_ivp(field, (0, 10), [0.1, 0.1, 0.2, 0.1], method='DOP853')"),
     "Hénon–Heiles, a Verlet loop": ("numba", LOOP, "steps(y, 0.05, 200)"),
     "Hénon–Heiles, Taylor": ("heyoka", HEYOKA, TAYLOR),

@@ -155,14 +155,15 @@ def values(x: Any) -> np.ndarray | None:
     """Return the values of x, of a tensor (*lanes, *x.shape), lanes of vmap first; None where torch.compile traces."""
     if not is_tensor(x):
         return np.asarray(x)
-    plain, order = (x, None) if _is_plain(x) else _behind(x)
+    if _is_plain(x):
+        return x.detach().cpu().numpy()
+    plain, order = _behind(x)
     if plain is None:
         return None
     import torch
 
     with torch._C._DisableFuncTorch():
-        found = plain.detach().cpu().numpy()
-        return found if order is None else found.transpose(order)
+        return plain.detach().cpu().numpy().transpose(order)
 
 
 def values_of_times(t: Any, remedy: str) -> np.ndarray:
@@ -267,7 +268,8 @@ def _is_transformed(x: Any) -> bool:
         return True
     if functorch.is_legacy_batchedtensor(x):  # cotangents side by side, of torch.autograd.grad(is_grads_batched=True)
         return True
-    return torch.autograd.forward_ad.unpack_dual(x).tangent is not None
+    forward = torch.autograd.forward_ad
+    return forward._current_level >= 0 and forward.unpack_dual(x).tangent is not None
 
 
 def _is_symbolic(x: Any) -> bool:

@@ -31,6 +31,7 @@ from sympflow.arrays import (
     differentiable,
     finite_states,
     full_of_nan,
+    is_tensor,
     known_finite,
     lanes,
     last,
@@ -63,7 +64,8 @@ if TYPE_CHECKING:
     from sympflow.hamiltonian.parameter_rows import ParameterRows
     from sympflow.storage.runs import RunStore
 
-COMPARED = 16  # outputs of a run with a chosen step, at most, at which it is compared with one of half the step
+COMPARED = {"state": 16, "energy": 256}
+"""Outputs of a run with a chosen step, at most, at which it is compared with one of half the step."""
 FIRST_WINDOW = 4096  # steps of the first of the ever longer runs to an infinite end
 
 
@@ -117,8 +119,9 @@ def solve(
         The largest relative energy error that is asked for; on the logarithmic clock, which may keep H where the time
         is wrong, the error of states. A method of fixed steps takes the step that `sympflow.choose_step` finds by short
         trial runs; for "sympflow" it chooses the flow, see its option. The error of the run itself is in `stats`,
-        "energy_error" or "state_error": where it is larger, a RuntimeWarning and the message say so. That of states,
-        or with friction or a drive, is found by another run with half of the step.
+        "energy_error" or "state_error": where it is larger, a RuntimeWarning and the message say so. That of states
+        is found by another run with half of the step; with friction or a drive the energy is balanced with the work,
+        which is that of runs with half of the step from one output to the next.
     tol_of : {"energy", "state"}
         See `sympflow.choose_step`.
     params : mapping of str to array_like, optional
@@ -353,21 +356,34 @@ def _check_tolerance_met(
 def _change_by_halves(
     sol: Solution, integrator: Integrator, problem: Problem, rows: ParameterRows | None, tol_of: str
 ) -> np.ndarray:
-    """The differences of states, or of H, at some outputs from a run with half of the step."""
-    few = slice((len(sol.t) - 1) % (every := -(-len(sol.t) // COMPARED)), None, every)  # with the last
+    """The differences of states at some outputs from a run with half of the step, or the error of the energy's balance.
+
+    This is the sum of the differences of H from runs between the outputs, each from the state before: orbits of chaos
+    part without any error.
+    """
+    few = slice((len(sol.t) - 1) % (every := -(-len(sol.t) // COMPARED[tol_of])), None, every)  # with the last
     half: Any = replace(integrator, dt=0.5 * integrator.dt)  # type: ignore[attr-defined, type-var]
     y0, times = problem.y0 if rows is not None else to_numpy(problem.y0), sol.t[few]
-    alike = replace(problem, y0=y0, t1=float(times[-1]), t_eval=times, save_every=1, dense_output=False, events=None)
-    try:
-        finer = _answered(half, replace(alike, diagnosed=False), "ignore", rows)
-    except Interrupted as stop:
-        raise Interrupted(stop.outcome, sol) from None
-    n = len(finer.t)
+    states = to_numpy(sol.states)[..., few, :]
+
+    def finer(start: Array, t0: float, ends: np.ndarray) -> Solution:
+        alike = replace(problem, y0=start, t0=t0, t1=float(ends[-1]), t_eval=ends, save_every=1, dense_output=False)
+        try:
+            return _answered(half, replace(alike, events=None, diagnosed=False), "ignore", rows)
+        except Interrupted as stop:
+            raise Interrupted(stop.outcome, sol) from None
+
     if tol_of == "energy":
-        H = to_numpy(sol.energy())[..., few][..., :n]
-        return (H - to_numpy(finer.energy())) / sol.energy_scale()[..., None]
-    change = to_numpy(sol.states)[..., few, :][..., :n, :] - to_numpy(finer.states)
-    return state_error(sol.system, to_numpy(y0), change)
+        H, off = to_numpy(sol.energy())[..., few], np.zeros((*states.shape[:-2], len(times)))
+        for k in range(len(times)):
+            start, t0 = (states[..., k - 1, :], float(times[k - 1])) if k else (y0, problem.t0)
+            ended = finer(start, t0, times[k : k + 1])
+            if not len(ended.t):
+                return off[..., :k] / sol.energy_scale()[..., None]
+            off[..., k] = off[..., k - 1] + H[..., k] - to_numpy(ended.energy())[..., 0]
+        return off / sol.energy_scale()[..., None]
+    whole = finer(y0, problem.t0, times)
+    return state_error(sol.system, to_numpy(y0), states[..., : len(whole.t), :] - to_numpy(whole.states))
 
 
 def _answered(integrator: Integrator, problem: Problem, action: str, rows: ParameterRows | None) -> Solution:
@@ -446,7 +462,11 @@ def _solved_followed(integrator: Integrator, problem: Problem, action: str, rows
     """The solution of trajectories to whose parameters gradients flow: one run, whatever the values."""
     numbers = {name: as_tensor(value.copy()) for name, value in rows.values.items() if name not in rows.followed}
     followed = {name: rows.followed[name] if name in rows.followed else numbers[name] for name in rows.values}
-    parameter_values = np.array([np.ravel(value) for value in rows.values.values()])
+    letters = None if problem.system.local is None else problem.system.local.letters(followed)
+    if letters is not None:
+        followed = {name: x if is_tensor(x) else as_tensor(np.array(x)) for name, x in letters.items()}
+    columns = [np.broadcast_to(to_numpy(value), rows.shape) for value in followed.values()]
+    parameter_values = np.array([np.ravel(value) for value in columns])
     together = replace(problem, parameter_values=parameter_values, followed=followed, diagnosed=False)
     if problem.system.between_impulses is not problem.system or problem.events is not None or action == "stop":
         raise ValueError(

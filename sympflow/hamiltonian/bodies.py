@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cache, cached_property, lru_cache
 from itertools import combinations
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import sympy as sp
@@ -72,9 +72,12 @@ class PairsHamiltonian(LocalHamiltonian):
         self.leaps = not self.softening
         self.is_few = self.n_bodies * (self.n_bodies - 1) // 2 * self.dim <= MOST_WRITTEN  # pairs are written out
         self._all_at_once = self.n_bodies <= ALL_AT_ONCE and self.cutoff is None
-        self.inertia = np.where(self.masses > 0, self.masses, 1.0)  # the momentum of each body over its velocity
         self._set_params(params)
         self._read(potential, {"m": self.masses, **self._checked_bodies(bodies)})
+        self._set_inertia()
+
+    def _set_inertia(self) -> None:
+        self.inertia = np.where(self.masses > 0, self.masses, 1.0)  # the momentum of each body over its velocity
         mass = np.repeat(1 / self.inertia, self.dim)
         self.inverse_mass = None if (mass == 1).all() else mass
 
@@ -133,6 +136,7 @@ class PairsHamiltonian(LocalHamiltonian):
         self.second = tuple(b for b, is_used in zip(second, used, strict=True) if is_used)
         self.columns = np.array([x for x, is_used in zip(columns.values(), used, strict=True) if is_used])
         self.columns = self.columns.reshape(-1, self.n_bodies)
+        self._has_masses = used[0]  # which the first column is
         self.c, self.constants = c, tuple(self.params.values())
         self.of_distance = V
         V = V.subs(r, sp.sqrt(self.s))
@@ -156,10 +160,61 @@ class PairsHamiltonian(LocalHamiltonian):
         made_with = (self.dim, self.masses, self.box, self.cutoff, self.softening)
         return [made_with, self.V, self.columns, list(self.params.items())]
 
+    @property
+    def _mass_names(self) -> list[str]:
+        return [f"masses[{i}]" for i in range(self.n_bodies)]
+
+    def number_columns(self, params: Mapping[str, Any]) -> dict[str, Any]:
+        """Values of parameters, with those of `masses` (..., n) body by body."""
+        found = dict(params)
+        if "masses" in found and "masses" not in self.params:
+            masses = found.pop("masses")
+            masses = masses if is_tensor(masses) else np.asarray(masses)
+            if masses.ndim == 0 or masses.shape[-1] != self.n_bodies:
+                raise ValueError(
+                    f"`params` has masses of shape {tuple(masses.shape)}: give one for each of the {self.n_bodies} "
+                    "bodies, on the last axis."
+                )
+            if not (to_numpy(masses) > 0).all():
+                raise ValueError("`params` has masses that are not positive: change them.")
+            found |= {name: masses[..., i] for i, name in enumerate(self._mass_names)}
+        return found
+
+    def check_names(self, names: Iterable[str]) -> None:
+        own = self._mass_names
+        super().check_names(name for name in names if name not in own)
+
+    def check_numbers(self, names: Iterable[str]) -> None:
+        self.check_names(names)
+
+    def with_params(self, values: Mapping[str, Any]) -> Self:
+        return super().with_params(self.number_columns(values))
+
     def _take(self, params: Mapping[str, Any]) -> None:
-        self._set_params(params)
-        self.constants = (*self.params.values(), *self.constants[len(params) :])
+        masses = [params.get(name, m) for name, m in zip(self._mass_names, self.masses.tolist(), strict=True)]
+        self._set_params({name: value for name, value in params.items() if name in self.params})
+        self.constants = (*self.params.values(), *self.constants[len(self.params) :])
+        if masses != self.masses.tolist():
+            self.masses = checked_column("masses", masses)
+            self._check_masses()
+            if self._has_masses:
+                self.columns = np.concatenate([self.masses[None], self.columns[1:]])
+            self._set_inertia()
         self._check_continuous()
+
+    def letters(self, numbers: Mapping[str, Any]) -> dict[str, Any]:
+        """All that a pair and the drifts depend on, by letters: of the parameters and masses in `numbers` these."""
+        names = [*self.params, *self.c[len(self.params) :]]
+        found = {c.name: numbers.get(n, x) for n, c, x in zip(names, self.c, self.constants, strict=True)}
+        found["softening"] = self.softening**2
+        for k, side in enumerate(() if self.box is None else self.box.tolist()):
+            found |= {f"box_{k}": side, f"over_box_{k}": 1 / side}
+        masses = [numbers.get(name, m) for name, m in zip(self._mass_names, self.masses.tolist(), strict=True)]
+        found |= {f"w_{i}": 1 / mass for i, mass in enumerate(masses)}
+        for i, column in enumerate(self.columns.tolist()):
+            values = masses if i == 0 and self._has_masses else column
+            found |= {f"column_{i}_{k}": x for k, x in enumerate(values)}
+        return found
 
     @property
     def work(self) -> int:
@@ -175,12 +230,14 @@ class PairsHamiltonian(LocalHamiltonian):
         if self.box is not None or self.cutoff is not None or pairs > MOST_SPELLED_PAIRS:
             return None
         q, p = (sp.symbols(f"{name}1:{self.ndof + 1}", real=True) for name in "qp")
-        masses = np.repeat(self.masses, self.dim).tolist()
-        T = sp.Add(*(x**2 / sp.Float(2 * m) for x, m in zip(p, masses, strict=True)))
-        named = {c: sp.Symbol(f"{name}_", real=True) for c, name in zip(self.c, self.params, strict=False)}
-        columns = [[sp.Float(x) for x in column] for column in self.columns.tolist()]
-        V = self.written_potential(q, sp.Float(self.softening**2), columns, named)
-        return SymbolicHamiltonian(T + V, {f"{name}_": value for name, value in self.params.items()})
+        values = self.letters({})
+        letters = {name: sp.Symbol(name, real=True) for name in values}
+        T = sp.Add(*(letters[f"w_{i // self.dim}"] * x**2 / 2 for i, x in enumerate(p)))
+        columns = [[letters[f"column_{i}_{k}"] for k in range(self.n_bodies)] for i in range(len(self.columns))]
+        softening = letters["softening"] if self.softening else sp.S.Zero
+        V = self.written_potential(q, softening, columns, {c: letters[c.name] for c in self.c})
+        H = T + V
+        return SymbolicHamiltonian(H, {name: values[name] for name, s in letters.items() if s in H.free_symbols})
 
     def written_potential(
         self,

@@ -21,6 +21,7 @@ from sympflow.arrays import (
     differentiable,
     is_tensor,
     jacobian,
+    jvp,
     library,
     library_name,
     like,
@@ -479,12 +480,8 @@ class CallableHamiltonian(Definition):
         if (form := self._exact(y)) is not None:
             return form.time_derivative(x, t)
         if self.differentiates_itself:
-            import torch
-
-            from sympflow.arrays import jvp
-
-            s, tensor = torch.as_tensor(t, dtype=torch.float64), torch.as_tensor(x)
-            found = jvp(lambda u: self.hamiltonian(tensor, u), s, torch.ones_like(s))[1]
+            s, tensor = beside(t, as_tensor(x)), as_tensor(x)
+            found = jvp(lambda u: self.hamiltonian(tensor, u), s, 0 * s + 1)[1]
             return like(of_library(found, y), y)
         return _time_difference(lambda s: self.hamiltonian(x, s), t)
 

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from sympflow.arrays import Array, assemble, beside
-from sympflow.compiler.functions import apply, where
+from sympflow.compiler.functions import apply, is_zero, where
 from sympflow.compiler.program import CONDITIONS, Program, Recording, Traced, gradient, tangent, traced
 
 if TYPE_CHECKING:
@@ -91,10 +91,10 @@ class Entries:
 
     free_symbols: frozenset[Any] = frozenset()
 
-    def __init__(self, matrix: np.ndarray) -> None:
-        self._rows = matrix.tolist()
+    def __init__(self, rows: Sequence[Sequence[Any]]) -> None:
+        self._rows = rows
 
-    def __getitem__(self, place: tuple[int, int]) -> float:
+    def __getitem__(self, place: tuple[int, int]) -> Any:
         return self._rows[place[0]][place[1]]
 
 
@@ -117,7 +117,7 @@ class TracedHamiltonian:
         timed: bool = False,
         kinetic: Program | None = None,
     ) -> None:
-        self.ndof, self.program, self.separable = ndof, program, separable
+        self.ndof, self.program, self.separable, self._timed = ndof, program, separable, timed
         self.q = tuple(Variable(f"q{i + 1}") for i in range(ndof))
         self.p = tuple(Variable(f"p{i + 1}") for i in range(ndof))
         self.time = Variable("t") if timed else None
@@ -130,15 +130,34 @@ class TracedHamiltonian:
             return
         if kinetic is None:
             M = np.ones(ndof) if inverse_mass is None else inverse_mass
-            M = np.diag(M) if M.ndim == 1 else M
-            self.inverse_mass = Entries(M)
-            kinetic = traced(lambda *p: [_kinetic(M, p)], *(s.name for s in self.p))
+            rows: list[list[Any]] = [[*row] for row in (np.diag(M) if M.ndim == 1 else M).astype(object)]
+            self.inverse_mass = Entries(rows)
+            kinetic = traced(lambda *p: [_kinetic(rows, p)], *(s.name for s in self.p))
         self.T = Formula(kinetic, self.p)
         self._set_potential(Formula(program, (*times, *self.q)))
 
+    def named(self, names: Sequence[str]) -> TracedHamiltonian:
+        """The same with entries of M⁻¹ as parameters of these names: those of the diagonal, or all, row by row."""
+        d, form = self.ndof, TracedHamiltonian(self.ndof, self.program, True, timed=self._timed)
+        form.parameters, form.values = tuple(map(Variable, names)), (1.0,) * len(names)
+        rows: list[list[Any]]
+        if len(names) == d:
+            rows = [[s if i == j else 0.0 for j in range(d)] for i, s in enumerate(form.parameters)]
+        else:
+            rows = [[*form.parameters[i * d : (i + 1) * d]] for i in range(d)]
+        form.inverse_mass, letters = Entries(rows), [s.name for s in (*self.p, *form.parameters)]
+
+        def kinetic(*numbers: Any) -> list[Any]:
+            known = dict(zip(form.parameters, numbers[d:], strict=True))
+            return [_kinetic([[known.get(x, x) for x in row] for row in rows], numbers[:d])]
+
+        form.T = Formula(traced(kinetic, *letters), (*self.p, *form.parameters))
+        form._set_potential(self.V)
+        return form
+
     def _set_potential(self, V: Formula) -> None:
         T, n = self.T, len(V.variables)
-        variables = (*V.variables, *self.p)
+        variables = (*V.variables, *T.variables)
         H = traced(lambda *x: [V.program(*x[:n])[0] + T.program(*x[n:])[0]], *(s.name for s in variables))
         self.V, self.H = V, Formula(H, variables)
 
@@ -471,12 +490,12 @@ def _without_time(f: Formula, time: Variable, found: dict[Variable, Formula]) ->
     )
 
 
-def _kinetic(M: np.ndarray, p: Sequence[Any]) -> Any:
+def _kinetic(M: Sequence[Sequence[Any]], p: Sequence[Any]) -> Any:
     """½ pᵀM⁻¹p."""
     total: Any = 0.0
-    for i, row in enumerate(M.tolist()):
+    for i, row in enumerate(M):
         for j, entry in enumerate(row):
-            if entry:
+            if not is_zero(entry):
                 total = total + (0.5 * entry) * (p[i] * p[j])
     return total
 

@@ -66,6 +66,14 @@ class LocalHamiltonian(Definition, ABC):
         other._take({**self.params, **values})
         return other
 
+    def number_columns(self, params: Mapping[str, Any]) -> dict[str, Any]:
+        """Values of parameters, each with one for each trajectory at most."""
+        return dict(params)
+
+    def letters(self, numbers: Mapping[str, Any]) -> dict[str, Any] | None:
+        """The numbers of compiled code through which gradients flow to `numbers` of parameters, if they do."""
+        return None
+
     @abstractmethod
     def _take(self, params: Mapping[str, Any]) -> None:
         """Take values of all parameters, and what follows from them."""

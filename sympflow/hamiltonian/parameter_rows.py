@@ -216,6 +216,8 @@ def checked_rows(system: HamiltonianSystem, params: Any, batch: tuple[int, ...])
         raise TypeError(f"`params` must be a mapping of names to numbers or arrays; got {type(params).__name__}.")
     if not params:
         raise ValueError("`params` is empty: give values for parameters of the system, or leave it out.")
+    if system.local is not None:
+        params = system.local.number_columns(params)
     system.check_parameters(params)
     arrays = {name: _checked_values(name, value) for name, value in params.items()}
     try:

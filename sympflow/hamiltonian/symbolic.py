@@ -222,9 +222,9 @@ class SymbolicHamiltonian(Definition):
             H = written.xreplace({s: symbols.get(s.name, value) for s, value in values.items()})
             states = {*self.q, *self.p}
             form = self.like(sp.Add(*[term for term in sp.Add.make_args(H) if term.free_symbols & states]))
-            known = {s.name: s for s in values}
-            form.parameters, form.meanings = tuple(symbols.values()), tuple(known[name] for name in names)
-            form.values = tuple(float(values[s]) for s in form.meanings)
+            meanings = [sp.Symbol(name, real=True) for name in names]
+            form.parameters, form.meanings = tuple(symbols.values()), tuple(meanings)
+            form.values = tuple(float(values.get(s, 0.0)) for s in meanings)  # 0 of one that H does not have
             self._named[key] = form
         return self._named[key]
 
@@ -929,7 +929,7 @@ def _hessian_by_program(
     try:
         program = recorded(f, variables)
     except NotCompiled:
-        return generate(list(hessian(f, variables[:n])), variables, library)
+        return generate([printable(entry) for entry in hessian(f, variables[:n])], variables, library)
     x = program.inputs[:n]
     rows = [slopes(s, x[: i + 1]) for i, s in enumerate(slopes(program.outputs[0], x))]
     return Program(program.inputs, [rows[max(i, j)][min(i, j)] for i in range(n) for j in range(n)])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
@@ -36,6 +37,9 @@ KEPT = 1e-12  # errors of the energy that are round-off, whatever the step
 TRIALS = 12
 MOST_STATES = 16  # of a batch in trials
 LOOKED_AT = 64  # states of a trial at which the size of the terms of H is taken
+BALANCED = 16
+"""Parts of a run with friction or a drive, in each of which its energy is compared with that of half steps from its own
+state. What they differ by, added up, is the error of the balance of energy and work: the orbits may be chaotic."""
 SAFETY = 0.5  # of the tolerance, at which a step is aimed
 ENOUGH, MOST = 0.2, 0.7  # of the tolerance: errors with which a step is taken
 NEAR_POLE = tuple(10.0**-k for k in range(1, 7))
@@ -210,9 +214,10 @@ def choose_step(
         A method of fixed steps, such as "srkn11b"; None for the one that suits the system, as for `solve`.
     tol : float
         The largest error: |H − H₀| relative to the `energy_scale` of `sympflow.metrics.energy`. Where H is not
-        conserved, with friction or a drive, the difference of H from that of a run with half of the step takes its
-        place. Where H is kept whatever the step, as by Gauss methods on a quadratic H, and for the methods on the
-        logarithmic clock, the error is that of the states; also of a driven H that jumps in t.
+        conserved, with friction or a drive, the error of the balance of energy and work takes its place: the sum of
+        the differences of H from short runs with half of the step, each from a state of the run. Where H is kept
+        whatever the step, as by Gauss methods on a quadratic H, and for the methods on the logarithmic clock, the error
+        is that of the states; also of a driven H that jumps in t.
     y0 : array_like of shape (..., 2d), optional
         Initial states, by default the system's.
     t_span : (float, float), optional
@@ -328,38 +333,45 @@ def _error(integrator: FixedStep, problem: Problem, tol_of: str, trial: float) -
     sign, length = math.copysign(1.0, problem.t1 - problem.t0), abs(problem.t1 - problem.t0)
     compiled, of_states = False, tol_of == "state"
 
-    def run(h: float, end: float, n: int) -> tuple[np.ndarray, np.ndarray]:
-        t = problem.t0 + sign * np.linspace(0.0, end, n + 1)
+    def run(h: float, t: np.ndarray, start: np.ndarray) -> np.ndarray:
+        """The states at times t, by steps h from the first one."""
         with np.errstate(all="ignore"):
             stepped = replace(integrator, dt=h)
-            piece = replace(problem, t1=float(t[-1]), t_eval=t, diagnosed=False)
+            piece = replace(problem, t0=float(t[0]), y0=start, t1=float(t[-1]), t_eval=t, diagnosed=False)
             _, jumps = landings(stepped, system, piece.t0, piece.t1)
             outcome = run_in_pieces(lambda *given: (given[0].run(given[1]), given[1]), stepped, piece, jumps)[0]
         nonlocal compiled
         compiled = outcome.stats.get("backend") == "compiled"
-        full = np.full((n + 1, *y0.shape), np.nan)
+        full = np.full((len(t), *y0.shape), np.nan)
         full[: len(outcome.y)] = outcome.y
-        return t, full
+        return full
 
     def error(h: float) -> float:
         n = max(TRIAL_STEPS, min(math.ceil(trial / h), MOST_TRIAL_STEPS) if compiled else 0)
         n = max(1, math.ceil(min(n, length / h)))
         end, n = min(n * h, length), -(-n // -(-n // TRIAL_STEPS))
-        t, y = run(h, end, n)
+        t = problem.t0 + sign * np.linspace(0.0, end, n + 1)
+        y = run(h, t, y0)
         times = np.broadcast_to(t.reshape(-1, *[1] * (y0.ndim - 1)), y.shape[:-1])
         few = slice(None, None, -(-n // LOOKED_AT))  # with the start
         with np.errstate(all="ignore"):
             H = np.asarray(system.hamiltonian(y, times))
             scale = known_scale(system, H[few], size_of_terms(system, y[few], times[few]))
             scale = np.where(np.isnan(scale), 1.0, scale)
-            if system.keeps_energy and not of_states:
+            if of_states:
+                found = state_error(system, y0, y - run(h / 2, t, y0))
+            elif system.keeps_energy:
                 found = np.abs(H - H[0]) / scale
+            elif not np.isfinite(H).all():
+                return math.inf
             else:
-                _, finer = run(h / 2, end, n)
-                if of_states:
-                    found = state_error(system, y0, y - finer)
-                else:
-                    found = np.abs(H - np.asarray(system.hamiltonian(finer, times))) / scale
+                off = np.zeros(H.shape)
+                bounds = np.linspace(0, n, min(BALANCED, n) + 1).astype(int)
+                for first, last in itertools.pairwise(bounds):
+                    part = slice(first, last + 1)
+                    fine = np.asarray(system.hamiltonian(run(h / 2, t[part], y[first]), times[part]))
+                    off[part] = off[first] + H[part] - fine
+                found = np.abs(off) / scale
         worst = float(np.max(found))
         return worst if math.isfinite(worst) else math.inf
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, cast
 import numpy as np
 
 from sympflow.arguments import check_flag
-from sympflow.arrays import Array, as_tensor, is_tensor, to_numpy, transformed, untransformed
+from sympflow.arrays import Array, as_tensor, is_tensor, learnable, to_numpy, untransformed
 from sympflow.flow.known import UNCOMPENSATED, KnownFlow
 from sympflow.flow.shipped import check_tol, choose, forces_saved, named, shipped_flows
 from sympflow.hamiltonian.fingerprint import Identity
@@ -166,9 +166,7 @@ class FlowIntegrator(FixedStep):
         """The compiled loops of the flow, or None where the call needs array operations or `backend` chooses them."""
         system = None
         if str(problem.y0.dtype) == "torch.float64":  # for float32 there is another flow
-            weights = [*cast(Any, flow).parameters()]
-            learns = any(x.requires_grad for x in weights) or transformed(*weights)
-            system = None if learns else problem.system
+            system = None if learnable(*cast(Any, flow).parameters()) else problem.system
         return compiled_loops(lambda: flow.kernel_for(problem.system), problem.y0, problem.backend, system=system)
 
     def own_stepper(self, problem: Problem) -> Stepper:

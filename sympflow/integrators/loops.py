@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sympflow.arrays import Array, differentiable, is_tensor, transformed
+from sympflow.arrays import Array, differentiable, is_tensor, to_numpy, transformed
 from sympflow.compiler import NotCompiled
 from sympflow.integrators.contract import Problem
 from sympflow.integrators.steppers import ArraySteps, Stepper
@@ -27,6 +29,20 @@ def stepper_of(
     if problem.parameter_values is not None:
         kernel = kernel.varied(problem.parameter_values)
     return with_loops(integrator, problem, arrays, kernel, told)
+
+
+def stepper_by_mass(
+    integrator: Any, problem: Problem, arrays: ArraySteps, make: Callable[[tuple[str, ...]], Any]
+) -> Stepper | None:
+    """Return the stepper of the loops of a system whose mass torch follows, if there are such loops."""
+    if problem.followed or not is_tensor(problem.y0) or problem.system.followed_mass is None:
+        return None
+    try:
+        by_mass = _by_mass(problem)
+        loops = _loops_by_values(make, by_mass, problem.system.definition)
+    except NotCompiled:
+        return None
+    return with_loops(integrator, by_mass, arrays, loops)
 
 
 def with_loops(
@@ -80,19 +96,40 @@ def compiled_loops(
 
 def _followed_loops(make: Callable[[tuple[str, ...]], Any], problem: Problem) -> Any:
     """The compiled loops, that `make` gives for names, of a run through which gradients flow to parameters."""
-    names, array = tuple(problem.followed), problem.backend == "array"
+    local = problem.system.local
     try:
-        if reason := "`backend` is 'array'." if array else _no_loops_for(problem.y0, problem.system):
-            raise NotCompiled(reason)
-        if problem.system.symbols is None:
+        if problem.system.symbols is None and (local is None or local.letters({}) is None):
             raise NotCompiled(f"`system` {problem.system.name!r} is not symbolic.")
-        loops = make(names)
-        loops.check_reverse()
-        return loops.varied(problem.parameter_values)
+        return _loops_by_values(make, problem, problem.system)
     except NotCompiled as error:
+        what = ", ".join(problem.followed) if local is None else "tensors that require gradients"
         raise ValueError(
-            f"`params` has {', '.join(names)}, but no gradient flows to parameters here: {error} Detach them."
+            f"`params` has {what}, but no gradient flows to parameters here: {error} Detach them."
         ) from error
+
+
+def _loops_by_values(make: Callable[[tuple[str, ...]], Any], problem: Problem, H: Any) -> Any:
+    """The compiled loops with values of what is followed, or NotCompiled."""
+    array = problem.backend == "array"
+    if reason := "`backend` is 'array'." if array else _no_loops_for(problem.y0, H):
+        raise NotCompiled(reason)
+    loops = make(tuple(problem.followed))
+    loops.check_reverse()
+    return loops.varied(problem.parameter_values)
+
+
+def _by_mass(problem: Problem) -> Problem:
+    """The problem of a system whose mass torch follows, with the entries of M⁻¹ as parameters that are followed."""
+    import torch
+
+    mass, n = problem.system.followed_mass, math.prod(problem.y0.shape[:-1])
+    of_form = problem.system.autonomous and problem.system.definition.form is not None
+    if transformed(mass) or mass.device.type != "cpu" or not of_form:
+        raise NotCompiled("`mass` is followed by other means than a graph, or stands beside functions as they are.")
+    mass = mass.double()
+    inverse = (1 / mass).expand(problem.system.ndof) if mass.ndim < 2 else torch.linalg.inv(mass).reshape(-1)
+    followed = {f"inverse_mass_{i}": entry for i, entry in enumerate(inverse.unbind())}
+    return replace(problem, followed=followed, parameter_values=np.repeat(to_numpy(inverse)[:, None], n, axis=1))
 
 
 def _no_loops_for(y0: Array, system: Any) -> str | None:

@@ -28,7 +28,7 @@ from sympflow.integrators.contract import (
     method_class,
 )
 from sympflow.integrators.interpolants import Mapped
-from sympflow.integrators.loops import compiled_loops, stepper_of
+from sympflow.integrators.loops import compiled_loops, stepper_by_mass, stepper_of
 from sympflow.integrators.methods import NAMES, TRIPLES
 from sympflow.integrators.steppers import Stepper
 from sympflow.schemes import CORRECTORS, POLYNOMIAL, SCHEMES, Scheme, checked_scheme, scheme_evaluations, scheme_named
@@ -359,6 +359,9 @@ class Splitting(FixedStep):
 
     def own_stepper(self, problem: Problem) -> Stepper:
         composition, compensated = self.composed(problem.system), bool(self.compensated)
+        by_mass = stepper_by_mass(self, problem, composition, partial(composition.kernel_by, compensated))
+        if by_mass is not None:
+            return by_mass
         make = composition.kernel_by if problem.followed else composition.kernel
         return stepper_of(self, problem, composition, partial(make, compensated), compensated)
 

@@ -80,6 +80,8 @@ class Stepper:
             self.why = f": `{name}` could not be traced, for {untraced}"
         if told and problem.system.symbols is not None:
             self.remark = f" Its steps were array operations: {_ADVICE.sub('.', told[0])}"
+        elif told and problem.system.form is not None:  # functions that were traced
+            self.why = f": {_ADVICE.sub('', told[0])}"
 
     @property
     def backend(self) -> str:

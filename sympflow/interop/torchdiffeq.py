@@ -349,7 +349,8 @@ def _landing(
     if endless:
         last = first + math.copysign(max(_LATE, abs(func.t_span[1] - func.t_span[0])), last - first)
     low, high, step = min(first, last), max(first, last), func.dt / 4
-    found = func.jump_times(low, high, step)
+    kinks = name in FIXED and FIXED[name].order > 2 and not endless  # of which adaptive steps take care
+    found = func.jump_times(low, high, step, kinks)
     if name in ADAPTIVE and not endless and func.definition.may_jump and "step_t" not in known:
         known["step_t"] = torch.as_tensor([last], dtype=torch.float64)  # a longer step may meet a jump beyond
     if not len(found):
@@ -361,7 +362,7 @@ def _landing(
     elif name in FIXED and not endless:
         length = known.pop("step_size", None)
         known |= {"grid_constructor": lambda _, y0, s: _with_jumps(s, length, found), "perturb": True}
-    if known == (options or {}) or len(func.jump_times(found.max(), high, step)):
+    if known == (options or {}) or len(func.jump_times(found.max(), high, step, kinks)):
         more = " after that too" if "jump_t" in known else ""
         warn(
             f"`func` {func.name!r} jumps in t, at t = {found.max() if more else found.min():.6g}{more}, where "

@@ -128,13 +128,7 @@ class FewSymbols:
     samples: Mapping[str, Any] = MappingProxyType({})
 
     def __init__(self, local: PairsHamiltonian) -> None:
-        named = {c.name: value for c, value in zip(local.c, local.constants, strict=True)}
-        named["softening"] = local.softening**2
-        for k, side in enumerate(() if local.box is None else local.box.tolist()):
-            named |= {f"box_{k}": side, f"over_box_{k}": 1 / side}
-        named |= {f"w_{i}": 1 / mass for i, mass in enumerate(local.masses.tolist())}
-        for i, column in enumerate(local.columns):
-            named |= {f"column_{i}_{k}": x for k, x in enumerate(column.tolist())}
+        named = local.letters({})
         self.local, self.ndof = local, local.ndof
         self.values, self.parameters = tuple(named.values()), tuple(map(sp.Symbol, named))
         self.q, self.p = (tuple(sp.Symbol(f"{x}{i + 1}") for i in range(self.ndof)) for x in "qp")

@@ -36,6 +36,15 @@ def splitting_loops(system: HamiltonianSystem, names: tuple[str, ...] = ()) -> S
     return SplittingLoops(system, names)
 
 
+def _traced_form(system: HamiltonianSystem, names: tuple[str, ...]) -> Any:
+    """The program of functions, with entries of M⁻¹ of these names as parameters where torch follows the mass."""
+    if system.followed_mass is None or not names:
+        return system.form
+    if system.friction:
+        raise arrays_only(f"`system` {system.name!r} has friction, and a mass that torch follows")
+    return system.definition.form.named(names)
+
+
 LANES_OF_SUMS, LANES = 16.0, 2.0
 """By how much less a kick takes in a batch than `SplittingLoops.work`: of sums and products alone, and of functions."""
 
@@ -91,14 +100,14 @@ class SplittingLoops:
                 self._has_ranges, self.traced = not self._large, True
                 sums = V is not None and not self._large and V.is_polynomial(*symbols.q)
                 self.abreast = LANES_OF_SUMS if sums else LANES
-        elif isinstance(system.form, TracedHamiltonian) and system.layered is None:
-            check_size(system.form)
+        elif isinstance(form := _traced_form(system, names), TracedHamiltonian) and system.layered is None:
+            check_size(form)
             check_damping(system, False)
             self._has_force_gradient = self.traced = True
-            V = system.form.V
+            self._form, self.values, V = form, form.values, form.V
             self.abreast = LANES_OF_SUMS if V is not None and V.is_polynomial() and not self.driven else LANES
             if self.driven:
-                driving = self._driving = system.form.driving
+                driving = self._driving = form.driving
                 self._form = driving.form
         elif system.numba_functions is not None:
             _, gradient, hessian_vector = system.numba_functions

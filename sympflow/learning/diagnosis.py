@@ -23,7 +23,7 @@ from scipy.optimize import minimize_scalar
 
 from sympflow.learning.lagrangian import lagrangian_start, least
 from sympflow.learning.library import Library, library_for, polynomials
-from sympflow.learning.models import Force, FreeField, Model, drags, frictions, turns
+from sympflow.learning.models import Force, FreeField, Model, drags, friction, frictions, turns
 from sympflow.learning.orbits import Field
 from sympflow.learning.parts import Drive, Polynomial
 from sympflow.learning.reading import Run
@@ -104,6 +104,7 @@ class Reading:
     rows: tuple[int, ...]  # The order in which it takes the coordinates
     numbers: slice | None = None  # The places of the factors of forces beside those of H
     share: float = math.inf  # Squares of held-out increments that it leaves, over those of the best Hamiltonian
+    theta: np.ndarray | None = None  # Its numbers by increments
 
     def of(self, data: Trajectories) -> Trajectories:
         """The data with the coordinates in this order."""
@@ -147,15 +148,17 @@ class Reading:
 def forced(model: Model, drives: Sequence[Drive] = ()) -> list[Reading]:
     """The model with forces that no H(q, p) gives: friction, what turns p, quadratic drag, drives; from plain to rich.
 
-    Of a model that has a force only a drive is of interest.
+    Of a model that has a force only a drive is of interest, and drag in place of friction.
     """
     rows = tuple(range(2 * model.ndof))
-    forces = [(frictions, Cause.FRICTION), (turns, Cause.TURNED), (drags, Cause.DRAG)]
+    forces = [(frictions, Cause.FRICTION), (drags, Cause.DRAG)]
+    if model.ndof > 1 and not model.velocities:  # among the models of velocities are magnetic fields
+        forces.insert(1, (turns, Cause.TURNED))
     made = []
-    for force, cause in forces[: 1 if model.velocities else 3]:  # among those of velocities are magnetic fields
-        if model.force is None and (force is not turns or model.ndof > 1):
+    for force, cause in forces:
+        if model.force is None or (force is drags and model.force in (friction, frictions)):
             with_force = replace(model, force=force)
-            made.append(Reading(cause, with_force, rows, slice(model.n, with_force.n)))
+            made.append(Reading(cause, with_force, rows, slice(model.n - model.forces, with_force.n)))
     if drives and not model.drives:
         driven = replace(model, parts=(*model.parts, *drives))
         numbers = slice(driven.places[len(model.parts)].start, driven.places[-1].stop)
@@ -171,18 +174,20 @@ def free_reading(scales: np.ndarray, degree: int) -> Reading:
 def best_by_increments(
     data: Trajectories, held: Trajectories, models: Sequence[Model], drives: Sequence[Drive] = (), stop: Stop = never
 ) -> tuple[int, Reading | None, dict[int, float]] | None:
-    """The place of the model that explains held-out increments best, a doubt, if any, and the squares by places.
+    """The place of the plainest of the models that explain held-out increments best, a doubt, and squares by places.
 
-    The doubt is a reading of the data that leaves much less than all models. None in place of all for too few points.
+    The doubt, if any, is a reading of the data that leaves much less than all models. None in place of all for too few
+    points.
     """
     scales, d, fitted, others = data.scales, data.ndof, data.sample, held.sample
     affordable = [k for k, model in enumerate(models) if affords(fitted, model)]
     if not affordable or not others.runs:
         return None
-    squares = {k: _left(models[k], fitted, others, scales) for k in affordable if not stop()}
+    squares = {k: _left(models[k], fitted, others, scales)[0] for k in affordable if not stop()}
     if not squares:
         return None
-    best = min(squares, key=lambda k: squares[k])
+    fewest = min(squares.values())
+    best = min((k for k in squares if squares[k] <= ALIKE * fewest), key=lambda k: models[k].n)
     if not 0 < squares[best] < math.inf:
         return best, None, squares
     readings = [free_reading(scales, degree) for degree in DEGREES]
@@ -196,9 +201,9 @@ def best_by_increments(
     for reading in readings:
         if stop() and reading.cause is not Cause.FREE:
             continue
-        left = _left(reading.field, reading.of(fitted), reading.of(others), scales[[*reading.rows]])
+        left, theta = _left(reading.field, reading.of(fitted), reading.of(others), scales[[*reading.rows]])
         if reading.cause not in likeliest or left / squares[best] < likeliest[reading.cause].share:
-            likeliest[reading.cause] = replace(reading, share=left / squares[best])
+            likeliest[reading.cause] = replace(reading, share=left / squares[best], theta=theta)
     least = min((reading.share for reading in likeliest.values()), default=math.inf)
     ordered = [likeliest[cause] for cause in Cause if cause in likeliest]  # the plainest that is about as good
     doubt = next((r for r in ordered if r.share <= (1.0 if r.cause is Cause.FREE else PLAINER) * least), None)
@@ -210,8 +215,11 @@ def affords(data: Trajectories, model: Field) -> bool:
     return model.n <= MOST_NUMBERS and PER_NUMBER * model.n < data.n_values
 
 
-def _left(model: Field, data: Trajectories, held: Trajectories, scales: np.ndarray) -> float:
-    """The squares that a model which was fitted to increments leaves of held-out ones; infinite where it diverges."""
+def _left(model: Field, data: Trajectories, held: Trajectories, scales: np.ndarray) -> tuple[float, np.ndarray]:
+    """The squares that a model which was fitted to increments leaves of held-out ones, and its numbers.
+
+    They are infinite where it diverges.
+    """
     theta, moved = np.zeros(model.n), data
     if model.velocities or model.lagrangian:
         assert isinstance(model, Model)
@@ -219,7 +227,7 @@ def _left(model: Field, data: Trajectories, held: Trajectories, scales: np.ndarr
     if model.linear:
         theta = matched(model, theta, moved, 1 / moved.scales)
     squares = increments_left(model, theta, held, 1 / scales)
-    return squares if math.isfinite(squares) else math.inf
+    return (squares if math.isfinite(squares) else math.inf), theta
 
 
 # by slopes -----------------------------------------------------------------------------------------------------------

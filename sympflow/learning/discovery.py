@@ -8,6 +8,7 @@ Bayesian criterion decides, which counts how many terms there were to choose fro
 
 from __future__ import annotations
 
+import itertools
 import math
 import sys
 from collections.abc import Callable, Iterable, Sequence
@@ -33,7 +34,7 @@ from sympflow.learning.trajectories import POINTS, Trajectories, periods_of
 from sympflow.learning.unseen import remark_on, tube, unseen
 from sympflow.show.cards import cut
 from sympflow.show.style import new_figure
-from sympflow.training.session import Session
+from sympflow.training.session import OutOfTime, Session
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -161,7 +162,7 @@ class Model:
     criterion : float
         The extended Bayesian criterion: less is better.
     held_out : float or None
-        The same residual of trajectories that no model was fitted to.
+        The same residual of trajectories that no model was fitted to; None where there was no time for it.
     """
 
     terms: tuple[sp.Expr, ...]
@@ -279,7 +280,7 @@ def discover(
     seed: int = 0,
     name: str = "discovered",
     time_budget: float | None = None,
-    progress: Callable[[str], None] | None = None,
+    progress: bool | Callable[[str], None] | None = None,
     **reading: Any,
 ) -> DiscoveredSystem:
     """Find a sparse H(q, p) = Σ θ_k f_k(q, p) behind trajectories, or behind a trained flow.
@@ -316,8 +317,8 @@ def discover(
         Of the system.
     time_budget : float, optional
         Seconds, after which the best model so far is taken; Ctrl-C ends the search likewise.
-    progress : callable, optional
-        It is called with a line for each model on the way.
+    progress : bool or callable, optional
+        True to show the models on the way, by default on a terminal; or a function of a line for each.
     **reading
         Options of `Trajectories.read`, such as `units` and `order`.
 
@@ -348,7 +349,10 @@ def discover(
     .. [2] J. Chen, Z. Chen, Extended Bayesian information criteria for model selection with large model spaces,
        Biometrika 95 (2008) 759–771.
     """
-    session = Session(time_budget=plain(time_budget))
+    shown = None if callable(progress) else plain(progress)
+    if not (shown is None or isinstance(shown, bool)):
+        raise TypeError(f"`progress` must be True, False or a function of a line of text; got {progress!r}.")
+    session = Session(time_budget=plain(time_budget), progress=False if callable(progress) else shown)
     if isinstance(data, FlowMap):
         if reading or noise is not None:
             raise TypeError(f"`{next(iter(reading), 'noise')}` is of trajectories, and `data` is a flow: leave it out.")
@@ -362,15 +366,14 @@ def discover(
     checked_number("held_out", held_out, "at least 0 and less than 1, as 0.2", lambda share: 0 <= share < 1)
     if piece is not None:
         check_positive("piece", piece)
-    if progress is not None and not callable(progress):
-        raise TypeError(f"`progress` must be a function of a line of text; got {progress!r}: leave it out.")
     degree = checked_count("degree", plain(degree), 1, HIGHEST, f"an integer from 1 to {HIGHEST}")
     most_terms = checked_count("most_terms", plain(most_terms), 1, sys.maxsize, "an integer, 1 or more")
     seed = checked_count("seed", plain(seed), 0, sys.maxsize, "an integer, 0 or more")
     huber = limit_of(loss)
-    say = progress or (lambda _: None)
-    search = _Search(trajectories, terms, degree, noise, held_out, piece, huber, most_terms, seed, say, session)
-    with session.interruption:
+    search = _Search(trajectories, terms, degree, noise, held_out, piece, huber, most_terms, seed, session)
+    with session.interruption, session.bar(None, "Models") as bar:
+        models = itertools.count(1)
+        search.say = progress if callable(progress) else lambda line: bar.tries(next(models), cut(line))
         discovery = search.run()
     box = np.array([trajectories.states.min(0), trajectories.states.max(0)])
     first = max(trajectories.runs, key=lambda run: run.span)
@@ -406,13 +409,13 @@ class _Search:
         huber: float | None,
         most_terms: int,
         seed: int,
-        say: Callable[[str], None],
         session: Session,
     ) -> None:
         self.session, self.over = session, session.deadline.over
         self.doubt: Reading | None = None
         self.tube: Domain | None = None
-        self.data, self.say, self.most_terms, self.huber = data, say, most_terms, huber
+        self.say: Callable[[str], None] = lambda _: None
+        self.data, self.most_terms, self.huber = data, most_terms, huber
         self.known = noise_of(noise, data.ndof)
         n = len(data.runs)
         drawn = np.random.default_rng(seed).permutation(n).tolist()
@@ -492,7 +495,8 @@ class _Search:
         if len(whole.runs) < 2:
             return None
         common, _ = library_for(None, self.data.ndof, 4, self.shown)
-        found = best_by_increments(*whole.split(), [self.library.model(), common.by_kind().model()])
+        models = [self.library.model(), common.by_kind().model()]
+        found = best_by_increments(*whole.split(), models, stop=self.over)
         return None if found is None else found[1]
 
     def _first(self, most: int, steps: int) -> list[int]:
@@ -503,7 +507,9 @@ class _Search:
         """
         regression = Regression.of_slopes(self.library, self.smooth, self.data.scales)
         most = min(most, self.most_terms)
-        found = [way(most, part) for part in self._parts() for way in (regression.forward, regression.backward)]
+        found = [regression.forward(most)]
+        for part in self._parts():
+            found += [way(most, part) for way in (regression.forward, regression.backward) if not self.over()]
         different = [[*way] for way in {tuple(sorted(active)) for active in found}]
         ways = sorted(different, key=regression.criterion)[:STARTS]
         for _ in range(8):
@@ -543,7 +549,7 @@ class _Search:
         model = self.library.subset(active).model()
         if model.separable not in self.methods:
             noise = np.maximum(self.expected, self.floor)
-            method = chosen_method(model, theta, self.pieces, STEP_SHARE * noise)
+            method = chosen_method(model, theta, self.pieces, STEP_SHARE * noise, stop=self._stop)
             self.methods[model.separable] = replace(method, longest=method.longest / 2**self.refined)
         return Problem(model, self.pieces, self.methods[model.separable], sigma, huber=self.huber)
 
@@ -677,8 +683,8 @@ class _Search:
         theta[fitted] = fit.theta
         whole = self._problem(range(K), theta, fit.problem.sigma)
         try:
-            return whole.normal(theta, fit.states).gains(fitted)
-        except np.linalg.LinAlgError:
+            return whole.normal(theta, fit.states, self._stop).gains(fitted)
+        except (np.linalg.LinAlgError, OutOfTime):
             return np.zeros(K)
 
     # the path, and the record -----------------------------------------------------------------------------------
@@ -766,10 +772,11 @@ class _Search:
         fit = self._known(active)
         problem = replace(fit.problem, sigma=sigma)
         held = None
-        if held_out is not None:
+        if held_out is not None and not self.over():
             pieces, starts = held_out
-            followed = minimized(replace(problem, data=pieces, frozen=True), fit.theta, starts, gain=CONVERGED)
-            held = _residual(followed.cost, pieces.n_values - starts.size)
+            frozen = replace(problem, data=pieces, frozen=True)
+            followed = minimized(frozen, fit.theta, starts, gain=CONVERGED, stop=self.over)
+            held = None if self.over() else _residual(followed.cost, pieces.n_values - starts.size)
         return Model(
             self.library.subset(active).expressions,
             tuple(fit.theta.tolist()),
@@ -800,6 +807,8 @@ class _Search:
         if found is None and self.doubt is not None:
             said, share = self.doubt.cause.said, self.doubt.share
             found = f"Of increments of trajectories {said} leaves {share:.1e} of the squares."
+            if self.doubt.theta is not None and self.doubt.possible(self.doubt.theta):
+                found = f"{found} {self.doubt.remedy(self.doubt.theta)}".strip()
         return (
             f"No sparse Hamiltonian of the library's {len(self.library)} terms explains the data: of "
             f"{self.data.names[worst]} it leaves {noise[worst]:.3g}, {excess[worst]:.1f} times the noise. "

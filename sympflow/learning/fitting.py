@@ -251,8 +251,8 @@ class Held:
     correlation: float  # Of one residual with the next, or with one a lag later; NaN where there are none
     pairs: int  # How many of them count as independent
     exact: bool  # True if residuals are no more than rounding and the scheme leave
-    # Their root mean square in σ, of the noise on the trajectories that the model was fitted to; ρ in place of the
-    # squares where the loss is robust
+    # Their root mean square in σ, of the noise on the trajectories that the model was fitted to; outliers are limited
+    # where the loss is robust
     loudness: float
     # The noise that the model leaves of a coordinate, over that which is seen without a model; the largest
     excess: float = 0.0
@@ -318,7 +318,7 @@ def judged(found: Fitted, held: Trajectories, setting: Setting) -> Held:
     lagged = setting.lag > held.time_scale and some >= FEWEST_PAIRS and abs(far) < FORGOTTEN
     correlation, pairs = (far, some) if lagged else (near, beside)
     losses = np.where(np.isfinite(losses), losses, np.inf)
-    loudness = math.sqrt(fit.cost / values)
+    loudness = math.sqrt(fit.counts @ (fit.variances / sigma**2) / values)
     excess = 0.0
     if setting.seen is not None and (setting.seen > 0).any() and not lagged:  # else it is not seen
         excess = float(np.max(found.sigma[setting.seen > 0] / setting.seen[setting.seen > 0]))

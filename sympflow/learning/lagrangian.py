@@ -89,7 +89,10 @@ class Equations:
         return (known + np.einsum("ijkn,k->ijn", by, theta[: self.n])).T
 
     def solved(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """θ, residuals and J by least squares: linear where momenta are observed, else by steps from M = 1."""
+        """θ, residuals and J by least squares: linear where momenta are observed, else by steps from M = 1.
+
+        Residuals are infinite, and J is 0, where curves whose velocities are not independent allow no such start.
+        """
         likely = self._stacked(self.by[: self.d] / self.scales[..., None])
         theta = np.zeros(self.model.n)
         right = ((self.second - self.value[: self.d]) / self.scales).ravel()
@@ -100,8 +103,13 @@ class Equations:
             J, right = np.concatenate([wide, rows]), np.concatenate([right, -rest])
             theta = least(J, right)
             return theta, right - J @ theta, J
-        theta[: self.n] = least(likely, right)  # p = v
+        for part, place in zip(self.model.parts, self.model.places, strict=True):
+            if part.inertial:
+                theta[place] = part.start(np.random.default_rng(0))
+        theta[: self.n] += least(likely, right - likely @ theta[: self.n])  # p = v
         left, J = self._left(theta)
+        if not np.isfinite(left).all():
+            return theta, left, J
         forces = np.arange(self.model.n) >= self.n  # first those alone
         forces[: self.n] = ~self.by_mass[1].any(axis=(0, 1, 3))
         for attempt in range(STEPS):
@@ -124,7 +132,7 @@ class Equations:
         rest, rows = self._rows(self.momenta(theta, self.q, self.v))
         M = self.masses(theta)
         if not (np.isfinite(M).all() and (np.linalg.eigvalsh(M) > 0).all()):
-            return np.full(rest.size, np.inf), np.empty(0)
+            return np.full(rest.size, np.inf), np.zeros((rest.size, self.model.n))
         W = np.linalg.inv(M)
         r = np.einsum("nij,jn->in", W, rest + np.einsum("ikn,k->in", rows, theta))
         rows[:, : self.n] -= np.einsum("ijkn,jn->ikn", self.by_mass[1], r)

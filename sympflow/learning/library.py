@@ -26,6 +26,7 @@ KINDS = "qpy"  # kinds of terms: of q alone, of p alone, of both
 Coordinates = tuple[sp.Symbol, ...]
 
 
+@lru_cache
 def coordinates(ndof: int) -> tuple[Coordinates, Coordinates]:
     """The symbols q1 … qd and p1 … pd."""
     return sp.symbols(f"q1:{ndof + 1}", real=True), sp.symbols(f"p1:{ndof + 1}", real=True)

@@ -34,6 +34,7 @@ from sympflow.learning.smoothing import Smooth
 from sympflow.learning.trajectories import Trajectories
 from sympflow.learning.unseen import remark_on, tube, unseen
 from sympflow.training import checkpoint as checkpoints
+from sympflow.training.least_squares import never
 from sympflow.training.session import Path, Session, Silent
 from sympflow.training.starts import step_of
 from sympflow.training.trainer import train
@@ -49,6 +50,7 @@ TABLE_SHARE = 0.3  # of a time budget, likewise
 HORIZONS = (1, 10, 100)  # in Δt, of the held-out errors
 POOR = 1e-3  # one-step error of a flow, relative to the spread of the data, that is worth a warning
 LEAST_SECONDS = 1.0  # for the flow, however late it is
+LEAST_REPLICAS = 2  # that are fitted however late it is
 MARGIN = 0.05  # of the spread of the states, by which Ω exceeds them
 FREER = 0.5  # of the squares, that a field which is not Hamiltonian must leave at most to be worth a word
 CERTAIN = 5.0  # standard errors that the factor of a force is worth a word
@@ -124,13 +126,15 @@ def replica(common: tuple[Model, Trajectories, Setting, np.ndarray, int], number
     """The numbers of a model that is fitted to trajectories drawn with repetition: a piece of work."""
     model, data, setting, theta, seed = common
     drawn = np.random.default_rng([seed, number]).integers(0, len(data.runs), len(data.runs))
+    setting = setting if number >= LEAST_REPLICAS else replace(setting, stop=never)
     return fitting.fitted(model, data.subset(drawn), setting, theta).theta
 
 
-def without_growth(found: Fitted) -> Fitted:
+def without_growth(found: Fitted, settled: bool = True) -> Fitted:
     """The fit with rates of friction that are not negative: those below 0 are 0, and other numbers the best beside.
 
-    Of data without friction chance makes half of the rates negative. One that is more than chance is told.
+    Of data without friction chance makes half of the rates negative. One that is more than chance is told, if the fit
+    came to its end.
     """
     model, theta = found.model, found.theta
     growing = np.arange(model.n) >= np.where(theta < 0, model.n - model.forces, model.n)
@@ -138,7 +142,7 @@ def without_growth(found: Fitted) -> Fitted:
         return found
     errors = np.sqrt(np.diag(found.fit.covariance()))
     worst = int(np.argmin(np.where(growing, theta / errors, np.inf)))
-    if theta[worst] < -GROWS * errors[worst]:
+    if settled and theta[worst] < -GROWS * errors[worst]:
         warn(
             f"`damping` is {theta[worst]:.2g} ± {errors[worst]:.1g} by the data, whose energy grows: it is taken as 0. "
             "Look at the order of the times and the sign of the momenta, or leave `damping` out."
@@ -261,8 +265,8 @@ class Search:
             found = fitting.refitted(self.final, self.whole or self.all, smooth, longer=True)
             shorter = found.span < self.final.span or not math.isfinite(found.fit.cost)
             self.final = self.final if setting.stop() and shorter else found
-        self.final = without_growth(self.final)
         self.cut = deadline.over()
+        self.final = without_growth(self.final, settled=not self.cut)
 
     def _ask(self, groups: list[Group], setting: Setting, session: Session) -> list[tuple[bool, list[Candidate]]]:
         """Keep the best of the simple models if no H explains the data, which is known before any other is fitted.
@@ -290,7 +294,7 @@ class Search:
                 return []
             self.best = self.reading = None
             self.tested.clear()
-        hopeless = [id(linear[k]) for k in squares if squares[k] > HOPELESS * squares[place]]
+        hopeless = [id(linear[k]) for k in squares if squares[k] > HOPELESS * min(squares.values())]
         kept = [(kind, [c for c in some if id(c) not in hopeless]) for kind, some in queue]
         # H = T(p) + V(q) is tried first, unless functions H(q, p) alone explain increments; networks last
         separable = [group.family.separable for group in groups]
@@ -413,17 +417,18 @@ class Search:
             elif self.unseen:
                 warn(remark_on(self.unseen))
             return
+        deadline = session.deadline
         if not math.isfinite(held.loudness):
+            found = None if deadline.over() else self._hint()
             warn(
                 f"The time budget ended before the best model, {candidate.name}, was compared with held-out "
-                "trajectories: give it more."
+                f"trajectories: give it more. {found or ''}".strip()
             )
             return
         said = (
             f"The best model, {candidate.name}, leaves residuals on held-out trajectories that are not noise: "
             f"{held.complaint}."
         )
-        deadline = session.deadline
         free = None if deadline.over() else self.freedom(replace(self.setting, stop=deadline.over))
         if free is not None:
             what = "H without the time" if free.defect < SYMPLECTIC else "symplectic map"
@@ -436,14 +441,17 @@ class Search:
             if free.remedy:
                 warn(f"{said} {free.remedy}")
                 return
-        smooth = self._whole(self.data).smooth
         otherwise = "Give more trajectories, say what is known of H, or give the `noise` if it is larger than it looks."
         if self.cut:
             otherwise = f"The time budget ended the search: give it more. {otherwise}"
+        warn(f"{said} {self._hint() or otherwise}")
+
+    def _hint(self) -> str | None:
+        """The likeliest reason why the best model does not explain the data, by slopes."""
+        smooth = self._whole(self.data).smooth
         library = library_for(None, self.data.ndof, 4, smooth.points)[0]
-        drives = [self.constraints.driven(w) for w in candidate.model.frequencies(self.best[1].theta)]
-        found = diagnosis.hint(library, smooth, self.data, self.constraints.force, drives)
-        warn(f"{said} {found or otherwise}")
+        drives = [self.constraints.driven(w) for w in self.best[0].model.frequencies(self.best[1].theta)]
+        return diagnosis.hint(library, smooth, self.data, self.constraints.force, drives)
 
     def freedom(self, setting: Setting) -> Freedom | None:
         """The comparison with a field that need not be Hamiltonian, where it explains much more than any H; else None.
@@ -460,7 +468,7 @@ class Search:
         if self.reading is not None:
             return self._beside(self.reading, setting)
         best, scales = self.best[0].model, self.data.scales
-        damped = [] if best.forces or not isinstance(best, Model) else diagnosis.forced(best)[:1]
+        damped = diagnosis.forced(best)[:1] if isinstance(best, Model) else []
         free = [r for r in (diagnosis.free_reading(scales, k) for k in (3, 2)) if self._affords_field(r.field)][:1]
         found = (self._beside(r, setting) for r in (*damped, *free) if self._affords_field(r.field))
         return next((one for one in found if one is not None), None)
@@ -490,14 +498,14 @@ class Search:
 
     def bootstrap(self, n: int, session: Session) -> Replicas:
         """Fit the chosen model to trajectories that are drawn anew, n times, or two at least until the time is up."""
-        setting = self.setting
+        setting = replace(self.setting, stop=session.deadline.over)
         model = self.best[0].model
         common = model, self.all, setting, self.final.theta, self.seed
         thetas: list[np.ndarray] = []
         for theta in session.each(replica, common, range(n), session.deadline):
-            thetas.append(theta)
-            if len(thetas) > 1 and session.deadline.over():
+            if len(thetas) >= LEAST_REPLICAS and session.deadline.over():  # this one was perhaps cut short
                 break
+            thetas.append(theta)
         if len(thetas) < n:
             warn(f"The time budget ended the bootstrap after {len(thetas)} of {n} replicas: bands are rough.")
         return Replicas(model, self.final.method, self.final.theta, np.stack(thetas), len(self.all.runs))

@@ -143,8 +143,8 @@ class Session:
             if executor is not None:
                 executor.shutdown(wait=False, cancel_futures=True)
 
-    def bar(self, total: int, label: str, start: int = 0) -> Silent:
-        """The display of so many steps, as a context."""
+    def bar(self, total: int | None, label: str, start: int = 0) -> Silent:
+        """The display of so many steps, None where nobody knows how many, as a context."""
         if not (sys.stderr.isatty() if self.progress is None else self.progress):
             return Silent()
         try:
@@ -217,8 +217,8 @@ class Silent:
 class Lines(Silent):
     """One line for each validation, where rich is not installed."""
 
-    def __init__(self, total: int, label: str) -> None:
-        self.total, self.label = total, label
+    def __init__(self, total: int | None, label: str) -> None:
+        self.total, self.label = total or "?", label
 
     def tries(self, done: int, what: str) -> None:
         print(f"{self.label} {done}/{self.total}  {what}", file=sys.stderr, flush=True)
@@ -227,7 +227,7 @@ class Lines(Silent):
 class Bar(Silent):
     """A bar with the losses, the one-step error and the time left."""
 
-    def __init__(self, total: int, label: str, start: int) -> None:
+    def __init__(self, total: int | None, label: str, start: int) -> None:
         from rich.console import Console
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 

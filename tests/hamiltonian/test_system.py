@@ -13,6 +13,7 @@ import torch
 from numba import njit
 
 from sympflow import Ball, HamiltonianSystem, solve, systems, volume_error
+from sympflow.hamiltonian.symbolic import MOST_WRITTEN, generate, hessian
 
 made = HamiltonianSystem.from_sympy
 
@@ -449,3 +450,16 @@ def test_without_y0_every_method_takes_the_same_default_step_whatever_was_read_b
     fresh, read = (made("p**2/2 + q**4/4", domain=domain) for _ in range(2))
     dt = float(f"{0.05 / (np.sqrt(3) * 9):.2g}") if domain is None else read.dt
     assert [solve(system, method, (0, 1), y0).stats["n_steps"] for system in (fresh, read)] == [np.ceil(1 / dt)] * 2
+
+
+def test_hessians_of_many_variables_are_those_of_their_expressions():
+    """They are programs: the expression is differentiated as a reference."""
+    d = 20
+    bonds = " + ".join(f"k*cos(q{i} - q{i + 1})/(1 + q{i}**2) + sqrt(2 + q{i}*q{i + 1})" for i in range(1, d))
+    system = made(" + ".join(f"p{i}**2/2" for i in range(1, d + 1)) + " + " + bonds, params={"k": 0.3})
+    symbols, q = system.symbols, np.random.default_rng(0).uniform(-1, 1, size=(3, d))
+    assert d > MOST_WRITTEN
+    reference = generate(list(hessian(symbols.V, symbols.q)), symbols.q, "numpy")
+    expected = np.stack([np.broadcast_to(x, 3) for x in reference(*q.T)], axis=-1).reshape(3, d, d)
+    np.testing.assert_allclose(system.potential_hessian(q), expected, rtol=1e-13, atol=1e-14)
+    np.testing.assert_allclose(system.potential_hessian(torch.tensor(q)).numpy(), expected, rtol=1e-13, atol=1e-14)

@@ -305,6 +305,16 @@ def test_large_functions_run_with_arrays_and_say_so(n, backend, said):
     assert re.search(said, repr(system))
 
 
+def test_functions_of_too_many_operations_say_so():
+    def V(q):
+        return (q**2).sum(-1) + sum(
+            np.sin(q[..., i % 20] * (1 + i)) * q[..., (7 * i + 1) % 20] ** 3 for i in range(999)
+        )
+
+    sol = solve(HamiltonianSystem(V, ndof=20), "verlet", (0, 0.01), np.linspace(0.01, 0.4, 40), dt=0.005)
+    assert re.match(r"numpy: `system` has \d,\d+ operations in its gradient, more than 5,000", sol.stats["backend"])
+
+
 def test_programs_can_be_read_and_pickled():
     system = HamiltonianSystem(lambda q: np.cos(q[..., 0]), ndof=1)
     assert str(system.program).startswith("(q1, p1) →\n")

@@ -27,6 +27,16 @@ def far(d):
     return np.random.default_rng(d).normal(size=2 * d)
 
 
+def bodies(n, dim):
+    """Of several kinds, in a box with a cut-off: written out or in memory."""
+    rng = np.random.default_rng(dim)
+    y0 = np.concatenate([rng.uniform(-9, 9, n * dim), rng.standard_normal(n * dim)])
+    masses, kinds = rng.uniform(1, 2, n), {"c": rng.uniform(-1, 1, n)}
+    space = {"dim": dim, "box": 4.0 + np.arange(dim), "cutoff": 1.9}
+    V = "c1*c2*(exp(-k*r) + log(1 + r)/(m1 + m2))"
+    return HamiltonianSystem.pairs(V, masses=masses, bodies=kinds, params={"k": 0.5}, y0=y0, dt=0.01, **space)
+
+
 def many(forces="", kinetic="p20**2/2", **more):
     """A chain of 20 bodies, whose terms are looped over."""
     H = f"{kinetic} + {BONDS} + cos(q1){forces}"
@@ -56,6 +66,12 @@ SYSTEMS = {
     "damped bodies": HamiltonianSystem.pairs(
         "-m1*m2/sqrt(r**2 + 0.01)", masses=np.linspace(1.0, 2.0, 10), dim=2, damping=0.1, y0=far(20), dt=0.01
     ),
+    "few damped bodies": HamiltonianSystem.pairs(
+        "-m1*m2/r", masses=[1.0, 0.5, 0.3], dim=2, damping=0.1, y0=far(6), dt=0.01
+    ),
+    "kinds in a box": bodies(5, 2),
+    "many on a line": bodies(20, 1),
+    "many in a box": bodies(20, 3),
     "chain": HamiltonianSystem.lattice(
         shape=12, onsite="k*q**2/2 + q**4/4", bond="r**2/2", params={"k": np.linspace(1, 2, 12)}, y0=far(12), dt=0.01
     ),
@@ -87,7 +103,9 @@ ROWS = [
     *(("polar, driven", m, {}) for m in ("strang_parts", "kahan_li6_parts")),
     ("kepler", "log_leapfrog", {}),
     *(("bodies", m, {}) for m in (*ANY, "tao4", "log_kahan_li8")),
-    *(("damped bodies", m, {}) for m in ANY),
+    *(("damped bodies", m, {}) for m in (*ANY, "verlet")),
+    ("few damped bodies", "verlet", {}),
+    *((kind, m, {}) for kind in ("kinds in a box", "many on a line", "many in a box") for m in ("verlet", "chin4a")),
     *(("chain", m, {}) for m in ("implicit_midpoint", "heun3", "srkn6b")),
     ("chain", "log_kahan_li8", {"shift": 200.0}),
     *(("function", m, {}) for m in ("tao4", "gauss_legendre4")),

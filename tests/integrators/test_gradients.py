@@ -426,7 +426,7 @@ def test_gradients_flow_to_masses(mass, method):
     system = HamiltonianSystem(of_two, ndof=2, mass=mass, y0=y0.numpy())
     (expected,) = torch.autograd.grad(verlet_by_hand(y0, mass, 10, 0.1).square().sum(), mass)
     sol = solve(system, "verlet", (0, 1), y0, dt=0.1)
-    assert sol.stats["backend"] == "torch"
+    assert sol.stats["backend"] == "compiled"
     (found,) = torch.autograd.grad(sol.y[:, -1].square().sum(), mass)
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-13)
     # of small steps
@@ -455,6 +455,52 @@ def test_masses_may_change_between_runs():
         np.testing.assert_allclose(sol.y[:, -1], expected, rtol=0, atol=1e-14)
     with pytest.raises(ValueError, match=r"^`mass` requires gradients, .* pass mass\.detach"):
         solve(system, "linear_srkn6b", (0, 1), y0, dt=0.1)
+
+
+BODIES = {
+    "three in space": ("-G*m1*m2/r", [1.0, 0.5, 0.2], 3, "kahan_li8", {}),
+    "with softening": ("-G*m1*m2/r", [1.0, 0.5, 0.2], 2, "srkn11b", {"softening": 0.1}),
+    "in a box": ("G*exp(-r)", [1.0, 0.5, 0.7], 1, "verlet", {"box": 6.0, "cutoff": 2.5}),
+    "two on a line": ("G*(r - 1)**2/2", [1.3, 0.6], 1, "gauss_legendre4", {}),
+    "by Runge and Kutta": ("G*(r - 1)**2/2", [1.3, 0.6], 1, "rk4", {}),
+}
+
+
+@pytest.mark.parametrize("batch", [(), (3,)], ids=["one", "batch"])
+@pytest.mark.parametrize("kind", BODIES)
+def test_gradients_flow_to_masses_and_parameters_of_bodies(kind, batch):
+    V, masses, dim, method, options = BODIES[kind]
+    system = HamiltonianSystem.pairs(V, masses=masses, dim=dim, params={"G": 1.2}, **options)
+    rng = np.random.default_rng(3)
+    q = np.arange(len(masses))[:, None] * np.eye(dim)[0] * 1.9 + 0.1 * rng.normal(size=(*batch, len(masses), dim))
+    q, p = (x.reshape(*batch, system.ndof) for x in (q, 0.2 * rng.normal(size=q.shape)))
+    y0 = np.concatenate([q, p], axis=-1)
+
+    def end(m, G):
+        sol = solve(system, method, (0.0, 1.0), y0, dt=0.05, t_eval=[1.0], params={"masses": m, "G": G})
+        assert sol.stats["backend"] == "compiled"
+        return (sol.y**2).sum()
+
+    m, G = (torch.tensor(x, dtype=torch.float64, requires_grad=True) for x in (masses, 1.2))
+    of_masses, of_G = torch.autograd.grad(end(m, G), (m, G))
+    h = 1e-5
+    differences = [(end(masses + h * e, 1.2) - end(masses - h * e, 1.2)) / (2 * h) for e in np.eye(len(masses))]
+    scale = np.abs(differences).max()
+    np.testing.assert_allclose(of_masses, differences, rtol=0, atol=1e-7 * scale)
+    np.testing.assert_allclose(of_G, (end(np.array(masses), 1.2 + h) - end(np.array(masses), 1.2 - h)) / (2 * h), 1e-6)
+
+
+def test_masses_of_bodies_are_parameters_of_a_run():
+    masses, y0 = np.array([1.0, 0.5, 0.2]), np.arange(18.0)
+    system = HamiltonianSystem.pairs("-1/r", masses=[1.0, 1.0, 1.0])
+    anew = HamiltonianSystem.pairs("-1/r", masses=masses)
+    sol = solve(system, "verlet", (0.0, 1.0), y0, dt=0.01, params={"masses": masses})
+    expected = solve(anew, "verlet", (0.0, 1.0), y0, dt=0.01)
+    np.testing.assert_array_equal(sol.y, expected.y)
+    np.testing.assert_array_equal(sol.energy(), expected.energy())
+    for wrong, message in (([1.0, 2.0], "one for each of the 3 bodies"), ([1.0, 0.0, 1.0], "not positive")):
+        with pytest.raises(ValueError, match=f"^`params` has masses .*{message}"):
+            solve(system, "verlet", (0.0, 1.0), y0, dt=0.01, params={"masses": wrong})
 
 
 def test_functions_of_tensors_run_in_inference_mode():

@@ -1,16 +1,18 @@
 """The test whether any Hamiltonian explains the data, before fits: friction, another order of columns, no H at all."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
 import sympflow
-from sympflow.learning.diagnosis import Cause, best_by_increments, hint
+from sympflow.learning.diagnosis import Cause, best_by_increments, forced, hint
 from sympflow.learning.families import FAMILIES
 from sympflow.learning.fitting import Setting
 from sympflow.learning.learner import _constraints
 from sympflow.learning.library import library_for
-from sympflow.learning.models import drags, frictions
+from sympflow.learning.models import drags, friction, frictions
 from sympflow.learning.parts import Drive, Polynomial
 from sympflow.learning.search import Search
 from sympflow.learning.trajectories import Trajectories
@@ -73,13 +75,16 @@ CASES = {
 }
 
 
+def candidates(data):
+    about = _constraints(data, None, None, False, None, None)
+    return [c.model for family in FAMILIES.values() if family.linear for c in family.models(about)]
+
+
 @pytest.mark.parametrize("name", CASES)
 def test_increments_tell_data_of_no_hamiltonian(name):
     make, cause = CASES[name]
     data = Trajectories.read(make())
-    about = _constraints(data, None, None, False, None, None)
-    models = [c.model for family in FAMILIES.values() if family.linear for c in family.models(about)]
-    _, reading, _ = best_by_increments(*data.split(), models)
+    _, reading, _ = best_by_increments(*data.split(), candidates(data))
     assert (None if reading is None else reading.cause) is cause
 
 
@@ -132,6 +137,26 @@ def test_hints_name_the_reason_and_its_size(field, d, known, said):
     assert said in str(found)
     one = data.subset([0])
     assert "driven" not in str(hint(library_for(None, d, 4, one.smooth.points)[0], one.smooth, data, **known))
+
+
+@pytest.mark.parametrize("force", [friction, frictions])
+def test_drag_is_told_from_friction_that_was_learned(force):
+    """Of a model with friction, drag in its place explains more of quadratic drag, and takes no more numbers."""
+    data = Trajectories.read(runs(dragged, 1, span=8.0, points=81))
+    model = replace(candidates(data)[2], force=force)
+    best, reading, _ = best_by_increments(*data.split(), [model])
+    assert best == 0
+    assert reading.cause is Cause.DRAG
+    assert reading.factors(reading.theta) == pytest.approx([0.2], rel=0.05)
+    assert not forced(replace(model, force=drags))
+
+
+def test_the_plainest_model_stands_for_those_that_are_as_good():
+    data = Trajectories.read(runs(dragged, 1, span=8.0, points=81))
+    models = candidates(data)
+    best, _, squares = best_by_increments(*data.split(), models)
+    assert squares[best] <= 1.2 * min(squares.values())
+    assert all(models[best].n <= models[k].n for k in squares if squares[k] <= squares[best])
 
 
 def test_reasons_are_looked_for_by_some_of_the_points():

@@ -167,6 +167,25 @@ def test_friction_and_a_wrong_library_are_told():
         sympflow.discover(measured(pendulum(), 0.01), ["p**2", "q**2"])
 
 
+def test_friction_that_increments_tell_comes_with_its_remedy():
+    """Slopes do not tell so little friction from noise."""
+    random, t = np.random.default_rng(11), np.linspace(0, 12, 120)
+    starts = random.uniform(-1.5, 1.5, (12, 2))
+    y = sympflow.solve(damped_pendulum(0.02), "gauss_legendre6", (0, 12), starts, t_eval=t, dt=0.05).y
+    with pytest.warns(UserWarning, match=r"leaves .* of the squares\. There is friction, γ = 0\.0.*damping=True"):
+        sympflow.discover((t, y + 0.01 * random.normal(size=y.shape)), ["p**2", "cos(q)"])
+
+
+def test_models_on_the_way_are_shown(capsys):
+    told = []
+    for progress in (told.append, False, True):
+        sympflow.discover(measured(pendulum(), 0.01), ["p**2", "cos(q)"], progress=progress)
+    assert any("criterion" in line for line in told)
+    assert "criterion" in capsys.readouterr().err
+    with pytest.raises(TypeError, match="`progress` must be True, False or a function"):
+        sympflow.discover(measured(pendulum(), 0.01), ["p**2", "cos(q)"], progress=3)
+
+
 def test_a_noise_that_is_not_that_of_the_data_is_told():
     data = measured(pendulum(), 0.01)
     with pytest.warns(UserWarning, match=r"leaves 0\.1\d* of the `noise` that was given"):

@@ -184,6 +184,22 @@ def test_families_are_those_that_velocities_tell():
         assert len(replace(constraints, inverse_mass=known).kinetic()) == parts
 
 
+def test_curves_on_which_velocities_are_no_free_numbers_give_a_start():
+    """On circles q' is a function of q and a centre, so that p = v has many solutions, some of no positive mass."""
+    random, s = np.random.default_rng(0), np.linspace(0, 10, 60)
+    c, r, f = random.normal(size=(2, 12, 1)), random.uniform(0.3, 2, (12, 1)), random.uniform(0, 6.3, (12, 1))
+    parts = c[0] + r * np.cos(s + f), c[1] + r * np.sin(s + f), -r * np.sin(s + f), r * np.cos(s + f)
+    y = np.stack(parts, axis=1) + 0.01 * random.normal(size=(12, 4, 60))
+    data = Trajectories.read((s, y), observed="qv")
+    found = next(FAMILIES["inertia"].models(_constraints(data, None, None, False, None, None)))
+    for _ in range(2):
+        fewer = pruned(found, *told(found.model, data.sample), data.n_values)
+        found = fewer or found
+    theta, precision = told(found.model, data.sample)
+    assert np.isfinite(theta).all()
+    assert precision.shape == (found.model.n, found.model.n)
+
+
 def test_only_the_factor_of_h_is_given():
     """(M⁻¹)₁₁ = 1 beside the numbers of all others."""
     constraints = Constraints(np.ones(4), None, None, None, np.full(4, np.inf), velocities=True, middle=np.zeros(2))

@@ -180,7 +180,7 @@ def test_another_lattice_is_refused_by_the_term_that_differs(flow, other, reason
 
 def test_what_is_no_lattice_is_refused(flow):
     written = HamiltonianSystem.from_sympy(ring(6).local.written_out())
-    with pytest.raises(ValueError, match=r"^`system` 'custom' has 6 degrees of freedom but the flow 40"):
+    with pytest.raises(ValueError, match=r"^`system` '.*' has 6 degrees of freedom but the flow 40"):
         solve(written, flow, (0, 5), np.full(12, 0.1), backend="array")
     with pytest.raises(ValueError, match=r"^`system` 'pairs' is of another kind than that of this flow"):
         solve(HamiltonianSystem.pairs("1/r", masses=np.ones(2), dim=2), flow, (0, 5), np.arange(8.0))
