@@ -204,7 +204,7 @@ class PairsHamiltonian(LocalHamiltonian):
 
     def letters(self, numbers: Mapping[str, Any]) -> dict[str, Any]:
         """All that a pair and the drifts depend on, by letters: of the parameters and masses in `numbers` these."""
-        names = [*self.params, *self.c[len(self.params) :]]
+        names = [*self.params, *self.c[len(self.params) :]][: len(self.c)]  # an `extra` potential has more
         found = {c.name: numbers.get(n, x) for n, c, x in zip(names, self.c, self.constants, strict=True)}
         found["softening"] = self.softening**2
         for k, side in enumerate(() if self.box is None else self.box.tolist()):

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from sympflow.arrays import Array, assemble, beside
+from sympflow.arrays import Array, assemble, beside, is_tensor
 from sympflow.compiler.functions import apply, is_zero, where
 from sympflow.compiler.program import CONDITIONS, Program, Recording, Traced, gradient, tangent, traced
 
@@ -278,7 +278,9 @@ class TracedHamiltonian:
     def _assembled(self, program: Program, x: Array, *t: Any, more: Sequence[Array] = ()) -> Array:
         arrays = (x, *more)
         columns = [a[..., i] for a in arrays for i in range(a.shape[-1])]
-        times = [beside(s, x) for s in t[: self.time is not None]]
+        times = t[: self.time is not None]
+        if is_tensor(x):
+            times = tuple(beside(s, x) for s in times)
         with np.errstate(all="ignore"):
             values = program(*times, *columns)
         return assemble(values, sum(columns[:: max(x.shape[-1], 1)]) if more else columns[0])

@@ -323,7 +323,7 @@ class Hamiltonian:
 
     def _time(self, t: Any, x: Array) -> tuple[Any, ...]:
         """The time that functions of a driven system take after the states x (..., k), checked; () of another."""
-        if self.autonomous:
+        if not self.definition.timed:
             return ()
         if self.definition.impulses:
             self.check_impulses(

@@ -412,6 +412,10 @@ class PlanetsHamiltonian(PairsHamiltonian):
         few = self.ndof <= MOST_SPELLED and self.n_bodies * (self.n_bodies - 1) // 2 <= MOST_SPELLED_PAIRS
         return "" if self.extra is None or few else "an `extra` potential of many bodies"
 
+    def letters(self, numbers: Mapping[str, Any]) -> dict[str, Any]:
+        own = [] if self.extra is None else [name for name in self._letters if name not in ("G", "m")]
+        return super().letters(numbers) | {f"{name}_": numbers.get(name, self.params[name]) for name in own}
+
     def written_potential(
         self,
         q: Sequence[sp.Expr],

@@ -206,7 +206,7 @@ def test_bad_systems_and_forces_of_potentials(oscillator):
         doubled(oscillator, ["-p1", "-p2"])
     with pytest.raises(TypeError, match="by functions"):
         doubled(HamiltonianSystem(lambda q: (q**2).sum(-1), ndof=1), "-p")
-    with pytest.warns(UserWarning, match="that of a potential"):
+    with pytest.warns(UserWarning, match="derives from a potential"):
         doubled(systems.pendulum(), "-q**3")
 
 
