@@ -4,6 +4,7 @@
     python benchmarks/planets.py --years 1e5                       the comparison at length
     python benchmarks/planets.py --long                            states after 100,000 years, and trained flows
     python benchmarks/planets.py --asteroids                       bodies without mass, on all cores
+    python benchmarks/planets.py --secular                         secular frequencies from 20 million years, minutes
     python benchmarks/planets.py --figure docs/figures/planets.png eccentricities over 200,000 years
     python benchmarks/planets.py --belt docs/figures/belt.png      asteroids over 100,000 years, four minutes
 
@@ -30,12 +31,13 @@ if "--asteroids" not in sys.argv:
 import numpy as np
 from measuring import fragments
 
-from sympflow import HamiltonianSystem, KeplerFit, elements, solve, train
+from sympflow import HamiltonianSystem, angular_momentum, elements, frequencies, shipped_flows, solve
 from sympflow.show.style import dress, new_figure
 from sympflow.systems import solar_system
 from sympflow.systems.planets import UNITS
 
 YEAR, TURN = 365.25, (0.0, 2 * np.pi)
+OUTER = "Jupiter", "Saturn", "Uranus", "Neptune"
 JUPITER, MARS = 5.2026, 1.67  # Jupiter's semi-major axis and Mars' aphelion, in AU
 OUTPUTS = 40
 METHODS = {
@@ -151,7 +153,7 @@ def table(years: float, steps: list[float], repeats: int) -> str:
 
 def belt(n: int, seed: int = 0) -> HamiltonianSystem:
     """Asteroids without mass among the four outer planets."""
-    rng, planets = np.random.default_rng(seed), solar_system(("Jupiter", "Saturn", "Uranus", "Neptune"))
+    rng, planets = np.random.default_rng(seed), solar_system(OUTER)
     orbits = {key: value[0] for key, value in elements(planets.y0[None], planets)._asdict().items()}
     ranges = {"a": (2.0, 3.6), "e": (0.0, 0.1), "inc": (0.0, 0.05), "node": TURN, "peri": TURN, "M": TURN}
     orbits = {key: np.append(orbits[key], rng.uniform(*ranges[key], n)) for key in ranges}
@@ -287,13 +289,14 @@ def _stepped(sim: Any, n: int) -> tuple[np.ndarray, float]:
     return np.concatenate([q.ravel(), q.ravel()]), worst
 
 
-TRAINED = {1e-8: KeplerFit(334.0, reach=128, gradients=0), 1e-9: KeplerFit(213.0)}
+TRAINED = {1e-8: "outer_planets-kepler-276.3", 1e-9: "outer_planets-kepler-160"}
+"""The flows that ship, by what is asked of them."""
 STEPS = np.geomspace(400.0, 60.0, 96)  # days between kicks of the methods that these are compared with
 
 
 def trained(years: float = 1e5) -> str:
     """The outer planets: a simulated day by trained flows and by other methods, each with its longest step."""
-    system, lines = solar_system(("Jupiter", "Saturn", "Uranus", "Neptune")), []
+    system, lines = solar_system(OUTER), []
     others = {"wisdom_holman": {"corrector": 17}, "kepler_takahashi_imada": {"corrector": 17}, "kepler_aba1064": {}}
 
     def error(method: Any, dt: float, options: dict[str, Any]) -> float:
@@ -305,19 +308,56 @@ def trained(years: float = 1e5) -> str:
         given = {"dt": dt, "save_every": n, "on_domain_exit": "ignore"}
         return least(lambda: solve(system, method, (0.0, n * dt), **given, **options), 3)[0] / (n * dt) * 1e9
 
-    for target, fit in TRAINED.items():
+    for target, file in TRAINED.items():
         rows = []
         for name, options in others.items():
             steps = 8 * STEPS if name == "kepler_aba1064" else STEPS
             dt = next(h for h in steps.tolist() if error(name, h, options) <= target)
             rows.append((f"`{name}`" + ", corrector 17" * bool(options), name, dt, options))
-        flow = train(system, fit)
-        rows.append((f"trained, over {fit.reach} steps to either side", flow, flow.dt, {}))
+        flow = next(f for f in shipped_flows(system) if f.name == file)
+        rows.append((f"trained, over {flow.reach} steps to either side", flow.load(system), flow.dt, {}))
         for title, *given in rows:
             found = error(*given), cost(*given)
             lines.append([f"{target:g}", title, f"{given[1]:.0f} d", f"{found[0]:.1e}", f"{found[1]:.2f} ns"])
             print(*lines[-1], flush=True)
     return fragments.table(["asked", "method", "step", "energy error", "a simulated day"], lines)
+
+
+SECULAR = {"g5": 4.2575, "g6": 28.2449, "g7": 3.0879, "g8": 0.6730, "s6": -26.3478, "s7": -2.9925, "s8": -0.6917}
+"""Arc seconds a year: J. Laskar and others, Astron. Astrophys. 428 (2004) 261–285."""
+RELATIVITY = {"extra": "-3*(G*m/(c*r))**2", "params": {"c": 173.1446}}
+
+
+def secular(planets: Any, years: float = 20e6) -> np.ndarray:
+    """Frequencies g5 to g8 of perihelia and s6 to s8 of nodes over the invariable plane, in arc seconds a year."""
+    scene = solar_system(planets)
+    masses, axes = scene.local.masses, np.eye(3)
+    z = angular_momentum(scene.y0, scene)
+    axes = np.array([a / np.linalg.norm(a) for a in (np.cross(axes[1], z), np.cross(z, np.cross(axes[1], z)), z)])
+    turned = (scene.y0.reshape(-1, 3) @ axes.T).ravel()
+    system = HamiltonianSystem.planets(masses, y0=turned, units=UNITS, **RELATIVITY)
+
+    def signal(y: np.ndarray) -> np.ndarray:
+        found = elements(np.moveaxis(y, -2, -1), system, about="jacobi")
+        perihelia = found.e * np.exp(1j * (found.node + found.peri))
+        nodes = np.sin(found.inc / 2) * np.exp(1j * found.node)
+        return np.moveaxis(np.concatenate([perihelia[..., -4:], nodes[..., -3:]], axis=-1), -1, -2)
+
+    dt = float(system.local.frame.periods.min()) / 25 if len(masses) < 9 else 11.0
+    given = {"dt": dt, "corrector": 17, "signal": signal, "n": 6, "samples": 50_000}
+    rows = frequencies(system, "wisdom_holman", (0.0, years * YEAR), **given).frequencies
+    seconds = rows * YEAR * np.degrees(1) * 3600
+    return np.array([row[np.argmin(np.abs(row - w))] for row, w in zip(seconds, SECULAR.values(), strict=True)])
+
+
+def secular_table() -> str:
+    """The frequencies of the four outer planets alone and of all eight."""
+    columns = [secular(planets) for planets in (OUTER, 8)]
+    rows = [
+        [name, *(f"{x:.4f}″ ({abs(x / right - 1):.0e})" for x in values), f"{right:.4f}″"]
+        for (name, right), *values in zip(SECULAR.items(), *columns, strict=True)
+    ]
+    return fragments.table(["", "four outer planets", "all eight", "Laskar"], rows)
 
 
 def figure(path: Path) -> None:
@@ -327,11 +367,11 @@ def figure(path: Path) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    system = solar_system(("Jupiter", "Saturn", "Uranus", "Neptune"))
+    system = solar_system(OUTER)
     sol = solve(system, t_span=(0.0, 200_000 * YEAR), save_every=500, on_domain_exit="ignore")
     orbits = elements(sol, about="jacobi")
     fig, axes = plt.subplots(2, 1, figsize=(7, 4.4), sharex=True, layout="constrained")
-    for k, name in enumerate(("Jupiter", "Saturn", "Uranus", "Neptune")):
+    for k, name in enumerate(OUTER):
         for axis, y in zip(axes, (orbits.e[k], np.degrees(orbits.inc[k])), strict=True):
             axis.plot(sol.t / YEAR / 1000, y, label=name, lw=0.8)
     axes[0].set_ylabel("eccentricity")
@@ -349,6 +389,7 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=2)
     parser.add_argument("--asteroids", action="store_true", help="measure bodies without mass on all cores")
     parser.add_argument("--long", action="store_true", help="compare states after 100,000 years, and trained flows")
+    parser.add_argument("--secular", action="store_true", help="find the secular frequencies of the outer planets")
     parser.add_argument("--figure", type=Path, help="draw this picture, and nothing else")
     parser.add_argument("--belt", type=Path, help="draw that of asteroids, and nothing else")
     fragments.add_out(parser)
@@ -358,6 +399,11 @@ def main() -> None:
         text = asteroids()
         print(text)
         fragments.write(given.out, "planets-asteroids", text)
+        return
+    if given.secular:
+        text = secular_table()
+        print(text)
+        fragments.write(given.out, "planets-secular", text)
         return
     if given.long:
         fragments.write(given.out, "planets-trained", trained())

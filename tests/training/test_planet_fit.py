@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from sympflow import HamiltonianSystem, KeplerFit, load, solve, systems, train
+from sympflow import HamiltonianSystem, KeplerFit, load, shipped_flows, solve, systems, train
 from sympflow.training import ClockedFit, GaussNewton
+from sympflow.training.shipped.recipe import Recipe
 
 OUTER = systems.solar_system(("Jupiter", "Saturn", "Uranus", "Neptune"))
 LIGHT = HamiltonianSystem.planets([1.0, 1e-3, 0.0], elements={"a": [1.0, 2.0]})
@@ -45,6 +46,25 @@ def test_a_tolerance_chooses_the_step(capsys):
     assert f"Δt {flow.dt:.4g}" in capsys.readouterr().err
     assert flow.figures["energy_error"] <= 1e-6
     assert 2 * np.pi / 100 < flow.dt <= 2 * np.pi / 4 * 1.001
+
+
+@pytest.mark.parametrize("system", [OUTER, systems.solar_system()])
+def test_those_that_ship_are_chosen_by_tolerance(system):
+    """Their figures are of 1e5 years; what takes longer is more accurate, and has its recipe."""
+    rungs = [f for f in shipped_flows(system) if f.reach]
+    errors = [f.energy_error for f in rungs]
+    assert len(rungs) > 2
+    assert errors == sorted(errors, reverse=True)
+    for rung in rungs:
+        sol = solve(system, "sympflow", (0, 1e4 * 365.25), tol=rung.energy_error * 1.001, save_every=400)
+        assert sol.stats["dt"] == rung.dt
+        assert np.abs(sol.energy_error()).max() < 1.1 * rung.energy_error  # at other times
+    assert solve(system, t_span=(0, 1000.0)).integrator.name == "wisdom_holman"  # where none is asked for
+    made = Recipe.of(rungs[0].path)
+    again = made.fitted(progress=False)
+    # singular values near the cutoff leave the numbers free, within what the orbits tell
+    assert again.figures["energy_error"] == pytest.approx(made.flow.figures["energy_error"], rel=0.05)
+    assert made.judge.__name__ == "of_planets"
 
 
 def test_where_it_does_not_hold(flow):
