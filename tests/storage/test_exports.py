@@ -159,7 +159,7 @@ def test_a_missing_library_is_asked_for(monkeypatch, tmp_path, library, call):
 
 
 def test_a_missing_library_of_ensembles_is_asked_for(monkeypatch, tmp_path):
-    how = {"reduce": "final", "dt": 0.5}
+    how = {"reduce": "final", "dt": 0.1}
     result = sympflow.ensemble(OSCILLATOR, "verlet", (0, 1), STATES[0], **how)
     stored = sympflow.ensemble(OSCILLATOR, "verlet", (0, 1), STATES[0], store=tmp_path / "a.zarr", **how)
     for library, made, call in (
