@@ -54,6 +54,8 @@ def scenes() -> list[HamiltonianSystem]:
         systems.henon_heiles(),
         systems.kepler(),
         systems.outer_solar_system(),
+        systems.solar_system(),
+        systems.solar_system(("Jupiter", "Saturn", "Uranus", "Neptune")),
         systems.fput(50.0),
         systems.fput(1000.0),
         systems.spring_pendulum(1e6, coordinates="polar"),
