@@ -448,12 +448,15 @@ class SymbolicHamiltonian(Definition):
 
     def _derivative(self, name: str, order: int) -> Callable[..., Array]:
         """A function of arrays: an expression, its gradient or its Hessian, by the order."""
+        key = name + "'" * order
+        if key in self._functions:
+            return self._functions[key]
 
         def expressions() -> list[sp.Expr]:
             f, x = getattr(self, name), self._variables(name)
             return [f] if order == 0 else gradient(f, x) if order == 1 else list(hessian(f, x))
 
-        key, n = name + "'" * order, len(self._variables(name))
+        n = len(self._variables(name))
         if order == 2 and n > MOST_WRITTEN:
             return self._function(key, lambda: [getattr(self, name)], _square, partial(_hessian_by_program, n))
         return self._function(key, expressions, (_single, assemble, _square)[order])
