@@ -107,8 +107,8 @@ def address(array: Any) -> int:
 def given(arguments: Sequence[Any]) -> list[Any]:
     """Return arguments as compiled code takes them: the places of arrays, and numbers."""
     try:
-        return [_PLACE(_BYTE(x)) if type(x) is np.ndarray else x for x in arguments]
-    except (TypeError, ValueError, BufferError):
+        return [_PLACE(_BYTE(x)) if isinstance(x, np.ndarray) else x for x in arguments]
+    except (TypeError, ValueError, BufferError):  # one of them is as above
         return [address(x) if isinstance(x, np.ndarray) else x for x in arguments]
 
 

@@ -135,12 +135,9 @@ def _basis(t: np.ndarray, k: int) -> Axis:
     return Axis(knots, np.stack(taylor, axis=-1))
 
 
-def _of_components(axes: Sequence[Axis], c: np.ndarray, beyond: Any) -> np.ndarray:
-    """A recorded spline for each component (n_1, …, n_d, …) of coefficients."""
-    found = np.empty(c.shape[len(axes) :], dtype=object)
-    for index in np.ndindex(found.shape):
-        found[index] = Recorded(axes, np.ascontiguousarray(c[(..., *index)]), beyond)
-    return found
+def _check_real(c: np.ndarray, order: int) -> None:
+    if order < 0 or np.iscomplexobj(c):
+        raise NotRecorded("it has a spline of complex numbers, or an antiderivative")
 
 
 def _beyond(extrapolate: Any) -> Any:
@@ -152,8 +149,9 @@ def _beyond(extrapolate: Any) -> Any:
 
 def _of_polynomials(x: np.ndarray, c: np.ndarray, nu: int, extrapolate: Any) -> np.ndarray:
     """A recorded spline for each component (…) of polynomials (k + 1, n, …) between knots."""
-    if nu < 0 or np.iscomplexobj(c):
-        raise NotRecorded("it has a spline of complex numbers, or an antiderivative")
+    _check_real(c, nu)
+    if x[-1] < x[0]:
+        raise NotRecorded("it has a PPoly with decreasing breakpoints: make it with increasing ones")
     found = np.empty(c.shape[2:], dtype=object)
     for index in np.ndindex(found.shape):
         axis = _polynomials(x, c[(..., *index)])
@@ -212,10 +210,12 @@ def _called_tensor(spline: Any, xi: Any, *, nu: Any = None, extrapolate: Any = N
 
 def _of_product(spline: Any, xi: Any, nu: Any, beyond: Any) -> Any:
     orders = [0] * len(spline.t) if nu is None else list(nu)
-    if np.iscomplexobj(spline.c) or min(orders) < 0:
-        raise NotRecorded("it has a spline of complex numbers, or an antiderivative")
+    _check_real(spline.c, min(orders))
     axes = [_basis(t, k).derived(n) for t, k, n in zip(spline.t, spline.k, orders, strict=True)]
-    return _each(_of_components(axes, spline.c, beyond), *_columns(xi, len(axes)))
+    found = np.empty(spline.c.shape[len(axes) :], dtype=object)
+    for index in np.ndindex(found.shape):
+        found[index] = Recorded(axes, np.ascontiguousarray(spline.c[(..., *index)]), beyond)
+    return _each(found, *_columns(xi, len(axes)))
 
 
 def _called_grid(spline: Any, xi: Any, method: Any = None, *, nu: Any = None) -> Any:
@@ -265,7 +265,7 @@ _LOCK = threading.RLock()
 def recorded_splines(is_traced: Callable[[Any], bool], wrapped: Callable[[Any, Any], Any]) -> Iterator[None]:
     """Record what SciPy's splines are called with that `is_traced`, where SciPy's splines are loaded.
 
-    They would ask numbers for values. Other calls, of other threads too, are as before.
+    SciPy itself needs values, and numbers that are traced have none. Other calls, of other threads too, are as before.
     """
     module = sys.modules.get("scipy.interpolate")
     if module is None:

@@ -1,8 +1,8 @@
 """Tables: rows of numbers that a program reads, such as the coefficients of a spline.
 
 Two functions of the table of functions read them: `entry`, the number at a place, and `interval`, the place of a number
-among others. Both are constant between two places, so that their derivatives are 0. Compiled code finds a table by the
-symbol that has its digest; its numbers are no part of the code.
+among others. Both are constant between two places, so that their derivatives are 0. Compiled code does not contain the
+numbers of a table: it finds them by a symbol, made from their digest.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 
 __all__ = ["TABLES", "Table", "entry_of", "interval_of"]
 
-SYMBOL = "sympflow_table_"  # with which the names of tables in code begin
+SYMBOL = "sympflow_table_"  # begins the names of tables in code
 TABLES: dict[str, Table] = {}
 """The tables that compiled code of this process reads, by their symbols: kept as long as that."""
 

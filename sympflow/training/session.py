@@ -144,7 +144,7 @@ class Session:
                 executor.shutdown(wait=False, cancel_futures=True)
 
     def bar(self, total: int | None, label: str, start: int = 0) -> Silent:
-        """The display of so many steps, None where nobody knows how many, as a context."""
+        """The display of so many steps, None where their number is not known, as a context."""
         if not (sys.stderr.isatty() if self.progress is None else self.progress):
             return Silent()
         try:

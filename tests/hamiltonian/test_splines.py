@@ -140,6 +140,7 @@ zero_beyond = UnivariateSpline(X, WELL, s=0, ext=1)
 @pytest.mark.parametrize(
     ("V", "d", "message"),
     [
+        (lambda q: PPoly(np.ones((4, 2)), [1.0, 0.0, -1.0])(q[..., 0]), 1, "decreasing breakpoints: make it with"),
         (lambda q: kinked(q[..., 0]), 1, "second derivative jumps: take a smoother one, such as CubicSpline"),
         (lambda q: linear((q[..., 0], q[..., 1])), 2, "with kinks: pass method='cubic'"),
         (bounded, 2, r"gives shape \(1,\) for one state: call it with coordinates"),
