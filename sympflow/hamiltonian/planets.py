@@ -249,19 +249,27 @@ class Frame:
                 f"`method` {method!r} needs the star as body 0, and body {i} is as heavy: put the heaviest first, or "
                 "take the splitting 'kinetic', such as 'srkn11b'."
             )
-        one, other = self.pairs
-        felt = states_of(self.elements[self.order - 1], self.G * (masses[0] + masses[self.order]))
-        near, far = np.triu_indices(len(self.order), 1)
-        d, u = (y[near] - y[far] for y in felt)
-        r = np.linalg.norm(d, axis=-1)
-        close = r < MOON * np.maximum(self.hill_radii(one, one, 0.0), self.hill_radii(other, other, 0.0))
-        bound = close & ((u * u).sum(-1) / 2 < self.G * (masses[one] + masses[other]) / r)
-        if bound.any():
-            first, second = sorted(int(i[bound][0]) for i in (one, other))
+        if self.bound_pair is not None:
+            first, second = self.bound_pair
             raise ValueError(
                 f"`method` {method!r} has each body on an orbit about the star, and bodies {first} and {second} are "
                 "bound to each other: take the splitting 'kinetic', such as 'srkn11b', or one body in place of both."
             )
+
+    @cached_property
+    def bound_pair(self) -> tuple[int, int] | None:
+        """Two bodies that are bound to each other at the start, or None."""
+        one, other = self.pairs
+        felt = states_of(self.elements[self.order - 1], self.G * (self.masses[0] + self.masses[self.order]))
+        near, far = np.triu_indices(len(self.order), 1)
+        d, u = (y[near] - y[far] for y in felt)
+        r = np.linalg.norm(d, axis=-1)
+        close = r < MOON * np.maximum(self.hill_radii(one, one, 0.0), self.hill_radii(other, other, 0.0))
+        bound = close & ((u * u).sum(-1) / 2 < self.G * (self.masses[one] + self.masses[other]) / r)
+        if not bound.any():
+            return None
+        first, second = sorted(int(i[bound][0]) for i in (one, other))
+        return first, second
 
     def crossing(self) -> tuple[int, int] | None:
         """Two planets with masses whose distances from the star overlap, or None."""

@@ -196,7 +196,7 @@ class SymbolicHamiltonian(Definition):
         symbols = _ParameterSymbols({s: value for s, value in values.items() if s not in samples})
         try:
             H = symbols.put_into(written.xreplace(samples))
-        except (TypeError, OverflowError):  # a value that is no real number
+        except (TypeError, OverflowError):  # a value that is not a real number
             return self
         states = {*self.q, *self.p}
         terms = sp.Add.make_args(H)
@@ -252,7 +252,7 @@ class SymbolicHamiltonian(Definition):
             return None
         try:
             numbers = tuple(float(part.xreplace(values)) for part in form.meanings)
-        except (TypeError, OverflowError):  # a value that is no real number
+        except (TypeError, OverflowError):  # a value that is not a real number
             return None
         if any(not math.isfinite(x) or x in (0, 1, -1) for x in numbers):
             return None
@@ -276,7 +276,7 @@ class SymbolicHamiltonian(Definition):
 
     @property
     def structure(self) -> SymbolicHamiltonian:
-        """H with the values with which it was first given: what does not depend on these is asked of it, once."""
+        """H with the values with which it was first given: whatever does not depend on these is found from it."""
         return self
 
     @property
@@ -448,12 +448,15 @@ class SymbolicHamiltonian(Definition):
 
     def _derivative(self, name: str, order: int) -> Callable[..., Array]:
         """A function of arrays: an expression, its gradient or its Hessian, by the order."""
+        key = name + "'" * order
+        if key in self._functions:
+            return self._functions[key]
 
         def expressions() -> list[sp.Expr]:
             f, x = getattr(self, name), self._variables(name)
             return [f] if order == 0 else gradient(f, x) if order == 1 else list(hessian(f, x))
 
-        key, n = name + "'" * order, len(self._variables(name))
+        n = len(self._variables(name))
         if order == 2 and n > MOST_WRITTEN:
             return self._function(key, lambda: [getattr(self, name)], _square, partial(_hessian_by_program, n))
         return self._function(key, expressions, (_single, assemble, _square)[order])

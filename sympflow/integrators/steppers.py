@@ -14,6 +14,7 @@ from sympflow.arrays import (
     differentiable,
     finite_states,
     full_of_nan,
+    is_tensor,
     library_name,
     like,
     stack,
@@ -154,17 +155,19 @@ def rollout(
     k = 0
     if carry is not None and carry.running is not None:
         k, y = carry.steps, carry.running
-    out, wanted = [], save.tolist()
+    tensor, position, wanted = is_tensor(y), 0, save.tolist()
+    out: Any = [full_of_nan(y)] * len(wanted) if tensor else np.full((len(wanted), *y.shape), np.nan, dtype=y.dtype)
     finite = np.where(finite_states(y, in_any_lane=True), n_steps, -1)
     if wanted and wanted[0] == 0:
-        out.append(copied(y))
+        out[0], position = copied(y), 1
     with np.errstate(all="ignore"):
         while k < n_steps and (finite == n_steps).any():
             start, y_start = k, y
             for k in range(start, min(start + block, n_steps)):
                 y = checked_state(step(k, y), y)
-                if len(out) < len(wanted) and wanted[len(out)] == k + 1:
-                    out.append(copied(y))
+                if position < len(wanted) and wanted[position] == k + 1:
+                    out[position] = copied(y) if tensor else y
+                    position += 1
             k += 1
             failed = (finite == n_steps) & ~finite_states(y, in_any_lane=True)
             if failed.any():
@@ -175,15 +178,16 @@ def rollout(
                     finite = np.where(first, j, finite)
     if carry is not None:
         carry.advance(n_steps, y)
-    out += [full_of_nan(y)] * (len(wanted) - len(out))
-    return stack(out, axis=0) if out else y[None][:0], np.asarray(finite)
+    if tensor:
+        out = stack(out, axis=0) if out else y[None][:0]
+    return out, np.asarray(finite)
 
 
 def checked_state(y_next: Any, y: Array) -> Array:
     """Return the result of a step from y, checked to be of the same kind, shape and dtype: it may be a plug-in's."""
     shape = getattr(y_next, "shape", None)
     if shape == y.shape and y_next.dtype == y.dtype:
-        if differentiable(y) and not (y_next.requires_grad or transformed(y)):
+        if is_tensor(y) and differentiable(y) and not (y_next.requires_grad or transformed(y)):
             raise TypeError(
                 "`step` loses the gradient of the tensors that it is given: pass NumPy arrays, or y0.detach(). A class "
                 "whose step takes arrays only says so by `arrays_only`."
