@@ -469,8 +469,8 @@ def announced_schemes() -> dict[str, EntryPoint]:
 def checked_scheme(scheme: Any) -> Scheme:
     """Return the scheme, if it is one of finite numbers that is consistent where it declares an order.
 
-    A TypeError if it is no Scheme, or not of numbers; a ValueError if a number is not finite, the order is no positive
-    integer, or kicks or drifts do not add up to 1.
+    A TypeError for anything but a Scheme of numbers; a ValueError if a number is not finite, the order is not a
+    positive integer, or kicks or drifts do not add up to 1.
     """
     if not isinstance(scheme, Scheme):
         raise TypeError(

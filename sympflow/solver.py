@@ -297,7 +297,7 @@ def _moving_times(t_span: Any, t_eval: Any) -> Any:
     ends = t_span if isinstance(t_span, (tuple, list)) else ()
     listed = t_eval if isinstance(t_eval, (tuple, list)) else (t_eval,)
     times = [t for t in (*ends, *listed) if type(t) not in (float, int, NoneType)]
-    if not times or not differentiable(*times):
+    if not differentiable(*times):
         return None
     from sympflow.integrators.tensors import MovingTimes
 

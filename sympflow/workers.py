@@ -399,7 +399,7 @@ def _by_map(workers: Any, call: _Call, clock: _Clock, todo: list[Numbered]) -> I
 
 
 def _result_of(future: Any, clock: _Clock) -> Any:
-    """The result of a future, None of what is none."""
+    """The result of a future; None for anything else."""
     result = getattr(future, "result", None)
     if not callable(result):
         return None

@@ -404,7 +404,7 @@ def test_scenes_of_the_drift_are_those_of_all_flows():
 
 
 def test_the_race_of_planets_on_a_pendulum(monkeypatch):
-    """Whose loops are compiled in no time: every racer meets the target, a flow with steps of at most its Δt."""
+    """Every racer meets the target, a flow with steps of at most its Δt; the loops of a pendulum compile fast."""
     monkeypatch.setattr(solar_system, "outer_solar_system", pendulum)
     monkeypatch.setattr(solar_system, "YEAR", 1.0)
     table = solar_system.run(years=20.0, target=1e-5, repeats=1, names=("kahan_li8",))
@@ -481,7 +481,7 @@ SMALL = {
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SMALL)
 def test_benchmarks_of_parts_run(name):
-    """Those that use what is inside of the package, in miniature."""
+    """Benchmarks that use internal parts of the package, in miniature."""
     script = Path(again.__file__).with_name(f"{name}.py")
     done = subprocess.run([sys.executable, str(script), *SMALL[name]], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

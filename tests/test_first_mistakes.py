@@ -310,6 +310,8 @@ def test_a_system_in_another_scene():
     assert other.with_scene(dt=0.1).dt == 0.1
     assert other.dt == system.dt == 0.005
     assert system.with_scene(domain=sympflow.Box([-1, -1], [1, 1])).domain.width == 2
+    forced = sympflow.doubled(other, "-p*q**2").physical
+    assert forced.with_scene(y0=[1, 0]).name == forced.name == "spring_forced"
 
 
 @pytest.mark.parametrize("function", [solve, systems.kepler, sympflow.lyapunov])

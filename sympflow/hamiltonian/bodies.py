@@ -184,9 +184,6 @@ class PairsHamiltonian(LocalHamiltonian):
         own = self._mass_names
         super().check_names(name for name in names if name not in own)
 
-    def check_numbers(self, names: Iterable[str]) -> None:
-        self.check_names(names)
-
     def with_params(self, values: Mapping[str, Any]) -> Self:
         return super().with_params(self.number_columns(values))
 

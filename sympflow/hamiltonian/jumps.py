@@ -428,7 +428,7 @@ class Switch:
 
 
 class Touch:
-    """The double zeros of a function g of t, of which H has a root such as sqrt(1 - cos(t)): kinks, not jumps."""
+    """The double zeros of a function g of t under a root in H, such as sqrt(1 - cos(t)): kinks, not jumps."""
 
     at_root = False
 
@@ -455,7 +455,7 @@ class Touch:
 
 
 def touches(f: sp.Expr, time: sp.Symbol, samples: Mapping[str, Samples]) -> list[Touch]:
-    """The functions of t alone of which f has a root, and which may vanish without a change of sign."""
+    """The functions of t alone that stand under a root in f, and may vanish without a change of sign."""
     bases = [power.base for power in f.atoms(sp.Pow) if power.exp.is_integer is False]
     bases += [g for a in f.atoms(sp.asin, sp.acos) for g in (1 - a.args[0], 1 + a.args[0])]
     bases += [a.args[0] - 1 for a in f.atoms(sp.acosh)]

@@ -92,7 +92,7 @@ class LocalHamiltonian(Definition, ABC):
         names = list(names)
         self.check_names(names)
         for name in names:
-            if isinstance(self.params[name], np.ndarray):
+            if isinstance(self.params.get(name), np.ndarray):
                 raise TypeError(
                     f"`params` has {name!r}, an array of the sites, and trajectories have numbers of their own: make a "
                     "system for each array, by system.with_params."

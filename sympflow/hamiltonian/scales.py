@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -179,8 +180,7 @@ def started(system: Any, y0: np.ndarray) -> Any:
 @lately_kept
 def _started(system: Any, dt: float, y0: bytes) -> Any:
     other = bare_copy(system)
-    other._dt = dt
-    other._y0 = np.frombuffer(y0).copy()
+    other._scene = replace(system._scene, dt=dt, y0=np.frombuffer(y0).copy())
     return other
 
 

@@ -196,7 +196,7 @@ class SymbolicHamiltonian(Definition):
         symbols = _ParameterSymbols({s: value for s, value in values.items() if s not in samples})
         try:
             H = symbols.put_into(written.xreplace(samples))
-        except (TypeError, OverflowError):  # a value that is no real number
+        except (TypeError, OverflowError):  # a value that is not a real number
             return self
         states = {*self.q, *self.p}
         terms = sp.Add.make_args(H)
@@ -252,7 +252,7 @@ class SymbolicHamiltonian(Definition):
             return None
         try:
             numbers = tuple(float(part.xreplace(values)) for part in form.meanings)
-        except (TypeError, OverflowError):  # a value that is no real number
+        except (TypeError, OverflowError):  # a value that is not a real number
             return None
         if any(not math.isfinite(x) or x in (0, 1, -1) for x in numbers):
             return None
@@ -276,7 +276,7 @@ class SymbolicHamiltonian(Definition):
 
     @property
     def structure(self) -> SymbolicHamiltonian:
-        """H with the values with which it was first given: what does not depend on these is asked of it, once."""
+        """H with the values with which it was first given: whatever does not depend on these is found from it."""
         return self
 
     @property

@@ -65,7 +65,6 @@ MEANT = {
     "names": "the bodies have numbers, from 0, in the order of `masses`.",
 }
 """Remedies for arguments that other packages have."""
-SCENE = ("name", "domain", "y0", "t_span", "dt", "energy_scale", "exact")
 
 
 class SceneOptions(TypedDict, total=False):
@@ -78,6 +77,9 @@ class SceneOptions(TypedDict, total=False):
     dt: float | None
     energy_scale: float | None
     exact: Callable[[Any], Array] | None
+
+
+SCENE = (*SceneOptions.__annotations__,)
 
 
 @dataclass(frozen=True)
@@ -267,7 +269,7 @@ class HamiltonianSystem(Hamiltonian, Answering):
     _period: float | None = None
     _former_period: float | None = None
     _continuous = True  # False of systems that are made of others, whose H may jump where solutions do not feel it
-    domain, t_span, energy_scale, exact = _OfScene(), _OfScene(), _OfScene(), _OfScene()
+    y0, domain, t_span, energy_scale, exact = _OfScene(), _OfScene(), _OfScene(), _OfScene(), _OfScene()
 
     def __init__(
         self,
@@ -773,9 +775,8 @@ class HamiltonianSystem(Hamiltonian, Answering):
 
     def _set_scene(self, params: Mapping[str, Any], scene: Scene) -> None:
         self._params = Parameters(params)
-        self._dt, self._y0 = scene.dt, scene.state(self.ndof)
         domain = None if scene.domain is None else domain_of(scene.domain, self)
-        self._scene = replace(scene, domain=domain)
+        self._scene = replace(scene, domain=domain, y0=scene.state(self.ndof))
         if self.domain is not None and self.domain.sample(1).shape != (1, 2 * self.ndof):
             raise ValueError(f"`domain` must be a set of states [q, p] of length {2 * self.ndof}.")
         self.definition.place(self.y0, self.domain, self.inverse_mass, self.t_span)
@@ -784,7 +785,7 @@ class HamiltonianSystem(Hamiltonian, Answering):
     def scene(self) -> Scene:
         """The scene for other parameters: an `exact` solution belongs to those of the system, and is left out."""
         dt = None if self.step_is_open else self.dt
-        return Scene(self._name, self.domain, self.y0, self.t_span, dt, self.energy_scale)
+        return replace(self._scene, name=self._name, dt=dt, exact=None)
 
     def with_scene(self, **scene: Unpack[SceneOptions]) -> HamiltonianSystem:
         """The same system with other defaults: of `name`, `domain`, `y0`, `t_span`, `dt`, `energy_scale` and `exact`.
@@ -798,8 +799,9 @@ class HamiltonianSystem(Hamiltonian, Answering):
         array([0., 2.])
         """
         other = bare_copy(self)
-        known = {**vars(self._scene), "y0": self._y0, "dt": self._dt}
-        known["exact"] = None if {"y0", "t_span"} & {*scene} else self.exact
+        known = {**vars(self._scene), "name": self._name}
+        if {"y0", "t_span"} & {*scene}:
+            known["exact"] = None
         settled = Scene.given({**known, **scene})
         other._name = settled.name
         other._set_scene(self._params, settled)
@@ -818,13 +820,10 @@ class HamiltonianSystem(Hamiltonian, Answering):
         raise AttributeError(f"`{name}` of a system cannot be set: {remedy}", name=name, obj=self)
 
     @property
-    def y0(self) -> Any:  # with the scene's, once it is checked
-        return self._y0
-
-    @property
     def dt(self) -> float:
         """The default step of the fixed-step classical methods: the one given, or by the fastest motion."""
-        return self._chosen_step if self._dt is None else self._dt
+        given = self._scene.dt
+        return self._chosen_step if given is None else given
 
     @cached_property
     def _chosen_step(self) -> float:
@@ -835,7 +834,7 @@ class HamiltonianSystem(Hamiltonian, Answering):
     @property
     def step_is_open(self) -> bool:
         """True if `dt` was not given, and the system has no states from which it could be chosen."""
-        return self._dt is None and self._y0 is None and self.domain is None
+        return self._scene.dt is None and self.y0 is None and self.domain is None
 
     @property
     def params(self) -> Mapping[str, float]:
@@ -1034,7 +1033,7 @@ class HamiltonianSystem(Hamiltonian, Answering):
             "structure": repr(self).rsplit("freedom, ", 1)[-1].rstrip(">"),
             "y0": "" if self.y0 is None else numbers(self.y0),
             "t_span": f"{self.t_span[0]:g} … {self.t_span[1]:g}",
-            "dt": "" if self._dt is None else f"{self._dt:g}",
+            "dt": "" if self._scene.dt is None else f"{self._scene.dt:g}",
             "domain": "" if self.domain is None else brief(repr(self.domain)),
         }
         return Card(self.title, facts, formula=formula)

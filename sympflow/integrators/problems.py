@@ -24,7 +24,7 @@ _FLOAT64 = np.dtype(np.float64)
 
 
 def check_backend(backend: Any, integrator: Integrator) -> None:
-    """Raise ValueError if it is not an initial state of the system, or if the method cannot take it."""
+    """Raise a ValueError for an unknown backend, or one that the method does not have."""
     if not isinstance(backend, str) or backend not in BACKENDS:
         raise ValueError(
             f"`backend` must be one of {', '.join(map(repr, BACKENDS))}; got {backend!r}: for a GPU pass tensors on it."

@@ -349,7 +349,7 @@ def _landing(
     if endless:
         last = first + math.copysign(max(_LATE, abs(func.t_span[1] - func.t_span[0])), last - first)
     low, high, step = min(first, last), max(first, last), func.dt / 4
-    kinks = name in FIXED and FIXED[name].order > 2 and not endless  # of which adaptive steps take care
+    kinks = name in FIXED and FIXED[name].order > 2 and not endless  # adaptive steps shorten there by themselves
     found = func.jump_times(low, high, step, kinks)
     if name in ADAPTIVE and not endless and func.definition.may_jump and "step_t" not in known:
         known["step_t"] = torch.as_tensor([last], dtype=torch.float64)  # a longer step may meet a jump beyond

@@ -104,7 +104,7 @@ class Reading:
     rows: tuple[int, ...]  # The order in which it takes the coordinates
     numbers: slice | None = None  # The places of the factors of forces beside those of H
     share: float = math.inf  # Squares of held-out increments that it leaves, over those of the best Hamiltonian
-    theta: np.ndarray | None = None  # Its numbers by increments
+    theta: np.ndarray | None = None  # The numbers of its field, fitted to increments
 
     def of(self, data: Trajectories) -> Trajectories:
         """The data with the coordinates in this order."""
@@ -148,7 +148,7 @@ class Reading:
 def forced(model: Model, drives: Sequence[Drive] = ()) -> list[Reading]:
     """The model with forces that no H(q, p) gives: friction, what turns p, quadratic drag, drives; from plain to rich.
 
-    Of a model that has a force only a drive is of interest, and drag in place of friction.
+    For a model that has a force only drives are tried, and drag in place of friction.
     """
     rows = tuple(range(2 * model.ndof))
     forces = [(frictions, Cause.FRICTION), (drags, Cause.DRAG)]
@@ -216,10 +216,7 @@ def affords(data: Trajectories, model: Field) -> bool:
 
 
 def _left(model: Field, data: Trajectories, held: Trajectories, scales: np.ndarray) -> tuple[float, np.ndarray]:
-    """The squares that a model which was fitted to increments leaves of held-out ones, and its numbers.
-
-    They are infinite where it diverges.
-    """
+    """The squares that a model fitted to increments leaves of held-out ones, infinite if it diverges; its numbers."""
     theta, moved = np.zeros(model.n), data
     if model.velocities or model.lagrangian:
         assert isinstance(model, Model)
@@ -379,7 +376,7 @@ def driven(
 ) -> tuple[float, list[float]]:
     """The share of squares that drives leave, and their ω; of other trajectories than those that they were fitted to.
 
-    From one trajectory a drive cannot be distinguished from its own motion: infinite.
+    The share is infinite for one trajectory, whose own motion cannot be distinguished from a drive.
     """
     first, v, near = smooth.owner % 2 == 0, smooth.slopes, 0.5 * np.pi / smooth.longest
 

@@ -1,4 +1,4 @@
-"""The system that an argument means: one, the name of a scene, or H as a formula."""
+"""The system that an argument means: one, the name of a scene, one in a file, or H as a formula."""
 
 from __future__ import annotations
 

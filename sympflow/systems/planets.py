@@ -29,8 +29,8 @@ STATES = np.array(
         [16.8120559831, -24.9917701761, 0.1272291482, 0.002579275595, 0.001776898889, -0.000095908896],
     ]
 )
-"""Of DE405 at J2000.0, JD 2451545.0, in the mean ecliptic and equinox of it, which the equator meets at 84381.448″; the
-Earth's row is the barycentre of Earth and Moon, other rows those of planets with their moons."""
+"""States of DE405 at J2000.0, JD 2451545.0, in the mean ecliptic and equinox of that date, with an obliquity of
+84381.448″. The Earth's row is the barycentre of Earth and Moon, each other row that of a planet with its moons."""
 
 _PHASES = 60  # of each planet's own path in the tube
 _THICKNESS = 0.2  # of the tube, relative to each planet's distance and speed

@@ -129,7 +129,10 @@ def _answering(function: Callable[..., Any], name: str, file: Path) -> Callable[
     def make(**params: Any) -> HamiltonianSystem:
         missing = [p.name for p in known if p.default is p.empty and p.name not in params]
         if missing:
-            raise ValueError(f"{where} needs a value of `{missing[0]}`: write {file.name}:{name}:{missing[0]}=number.")
+            raise ValueError(
+                f"{where} needs a value of `{missing[0]}`: give it a default in the file, or on the command line write "
+                f"{file.name}:{name}:{missing[0]}=number."
+            )
         try:
             system = function(**params)
         except (Exception, SystemExit) as error:

@@ -34,6 +34,16 @@ def test_lists_of_systems_and_methods():
     assert "W. Kahan" in result.output
 
 
+def test_one_system_is_shown_with_its_flows(tmp_path):
+    result = run("systems", "henon-heiles")
+    assert result.exit_code == 0, result.output
+    assert "p1**2/2 + p2**2/2 + q1**2*q2" in result.output
+    assert "henon_heiles-sympflow" in result.output
+    own = tmp_path / "quartic.toml"
+    own.write_text("hamiltonian = 'p**2/2 + q**4'")
+    assert "trained flows: none" in run("systems", own).output
+
+
 def test_compare_writes_a_table_figures_and_files(tmp_path):
     result = run("compare", "henon-heiles", "--methods", "verlet,leapfrog,rk45:rtol=1e-6", *FAST, "--out", tmp_path)
     assert result.exit_code == 0, result.output

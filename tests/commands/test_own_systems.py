@@ -178,7 +178,10 @@ def test_a_flow_is_trained_on_it_certified_and_used(files):
             "own.py:fails",
             "`system` 'fails' in 'own.py' failed (ZeroDivisionError: division by zero, line 21): mend it.",
         ),
-        ("own.py:needs", "needs a value of `k`: write own.py:needs:k=number."),
+        (
+            "own.py:needs",
+            "needs a value of `k`: give it a default in the file, or on the command line write own.py:needs:k=number.",
+        ),
         ("own.py:chain:power=2.5", "`power` must be a whole number; got '2.5'."),
         ("own.py:spring:k=1", "`k` is not a parameter of own-spring"),
         ("quartic.toml:x", "is one system, which has no 'x'"),

@@ -1,4 +1,4 @@
-"""What every metric says of a run that blew up, and of what is no run."""
+"""Metrics of a run that blew up, and of arguments that are not runs."""
 
 import numpy as np
 import pytest
