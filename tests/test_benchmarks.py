@@ -25,6 +25,7 @@ import drift
 import nonseparable
 import own_systems
 import peers
+import planets
 import plugins
 import primed
 import primed_ideas
@@ -414,6 +415,12 @@ def test_the_race_of_planets_on_a_pendulum(monkeypatch):
         assert float(error) <= 1e-5
         if name.startswith("flow"):
             assert float(step.split()[0]) <= float(name.split()[3])
+
+
+def test_secular_frequencies_of_the_outer_planets():
+    """Within what the inner planets add to them of Laskar's: g5 to g8 of perihelia, s6 to s8 of nodes."""
+    off = np.abs(planets.secular(planets.OUTER, years=5e6) / list(planets.SECULAR.values()) - 1)
+    assert (off < [4e-3, 1e-4, 2e-4, 3e-3, 5e-4, 5e-4, 1e-3]).all()
 
 
 def test_curvature_terms_come_nearer_at_the_same_step():

@@ -5,6 +5,8 @@ import pytest
 import torch
 
 from sympflow import HamiltonianSystem, solve, systems
+from sympflow.compiler import NotCompiled
+from sympflow.integrators.loops import compiled_loops
 
 HH = systems.henon_heiles()
 PLAIN = HamiltonianSystem(lambda q: np.median(q, axis=-1) ** 4, ndof=1, y0=[1.0, 0.0], gradient=lambda q: 4 * q**3)
@@ -55,6 +57,18 @@ def test_auto_chooses_what_applies(system, arguments, backend):
 def test_a_backend_that_does_not_apply_says_why(system, arguments, message):
     with pytest.raises(ValueError, match=message):
         solve(system, **{"method": "verlet", "t_span": (0.0, 1.0), **arguments})
+
+
+def test_only_an_error_that_says_so_means_array_operations():
+    def refused():
+        raise NotCompiled("`system` has no loops.")
+
+    def broken():
+        raise ValueError("a fault of the loops")
+
+    assert compiled_loops(refused, np.zeros(2), "auto") is None
+    with pytest.raises(ValueError, match="a fault"):
+        compiled_loops(broken, np.zeros(2), "auto")
 
 
 @pytest.mark.parametrize("q", [1e12, 1e16, 1e18, 1e21, 1e100, 1e300])

@@ -220,6 +220,21 @@ def test_no_integration(method):
     np.testing.assert_array_equal(solver.dense_output()(0.0), [1.0, 0.0])
 
 
+@pytest.mark.parametrize("n", [3, 4])
+def test_the_event_of_a_number_ends_the_run(n):
+    def zero(t, y):
+        return y[0]
+
+    zero.terminal = n
+    result = solve_ivp(fun, (0, 100), [1, 0], method=SOLVERS["kahan_li8"], events=zero)
+    assert len(result.t_events[0]) == len(result.y_events[0]) == n
+    np.testing.assert_allclose(result.y_events[0][:, 0], 0, atol=1e-13)
+    for wrong in (-1, 3.5):
+        zero.terminal = wrong
+        with pytest.raises(ValueError, match="`terminal` attribute"):
+            solve_ivp(fun, (0, 100), [1, 0], method=SOLVERS["kahan_li8"], events=zero)
+
+
 def test_args_reach_the_function_and_the_events():
     def scaled(t, y, omega, level):
         return [y[1], -(omega**2) * y[0]]
@@ -235,6 +250,12 @@ def test_args_reach_the_function_and_the_events():
         solve_ivp(scaled, (0, 5), [1.0, 0.0], method=method, args=(1.1, 0.5))
     with pytest.raises(TypeError, match="Supplied 'args' cannot be unpacked"):
         solve_ivp(scaled, (0, 5), [1.0, 0.0], method=method, args=-1)
+
+
+@pytest.mark.parametrize("wrong", [np.nan, np.inf])
+def test_the_initial_state_must_be_finite(wrong):
+    with pytest.raises(ValueError, match="must be finite"):
+        solve_ivp(fun, [0, 1], [wrong, 0.0], method=SOLVERS["verlet"])
 
 
 class TestPickle:

@@ -9,7 +9,7 @@ import pytest
 
 from sympflow import HamiltonianSystem, SympFlow, compare, get, reference_error, solve, stability, systems
 from sympflow.metrics.reference import Reference
-from sympflow.studies.attempts import Row
+from sympflow.studies.attempts import Row, interleaved
 from sympflow.studies.comparison import combined_table, matched
 
 QUICK = {"n_outputs": 50, "repeats": 1}
@@ -122,6 +122,15 @@ def test_a_reference_of_another_problem_is_refused():
     assert report.to_dict()["reference"] == {"method": "given", "accuracy": None}
 
 
+def test_a_solution_may_be_the_reference():
+    system, t = systems.pendulum(), np.arange(1, 51) / 5
+    truth = solve(system, "kahan_li8", (0, 10), t_eval=t)
+    report = compare(system, ["verlet"], ["error"], t_span=(0, 10), reference=truth, **QUICK)
+    verlet = solve(system, "verlet", (0, 10), t_eval=t)
+    assert report.rows[0].error == reference_error(verlet, truth).max()
+    assert report.reference.method == "given"
+
+
 def test_a_batch_is_summed_up_by_its_median_and_its_worst():
     system = systems.henon_heiles()
     y0 = system.domain.sample(5, 0)
@@ -148,6 +157,13 @@ def test_matching_finds_the_step_of_a_power_law():
         assert found.dt == pytest.approx(0.003, rel=0.06)
     found, _ = matched(get("verlet")(dt=1.0), system, lambda m: math.inf if m.dt > 0.5 else m.dt**2, 0.2**2, grows=True)
     assert found.dt == pytest.approx(0.2, rel=0.05)
+
+
+def test_repeats_are_interleaved():
+    order = []
+    times = interleaved([lambda: order.append("a"), lambda: order.append("b")], 3)
+    assert order == list("ababab")
+    assert len(times) == 2
 
 
 def test_files_hold_every_figure(report, tmp_path):

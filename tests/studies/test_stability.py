@@ -16,7 +16,9 @@ import sympflow
 from sympflow import HamiltonianSystem, max_energy_error, solve, stability, systems
 from sympflow.commands import app
 from sympflow.integrators.base import FixedStep
-from sympflow.studies.step_stability import blow_up, initial_states
+from sympflow.metrics.linear_stability import small_oscillations
+from sympflow.studies.attempts import candidates
+from sympflow.studies.step_stability import Search, Study, blow_up, initial_states
 
 pytestmark = pytest.mark.filterwarnings("ignore:`dt` .* is too long:RuntimeWarning")
 
@@ -64,6 +66,32 @@ def test_windows_below_the_limit_are_named_where_the_runs_bear_them():
     assert limit.stable > 4
     assert limit.linear == pytest.approx(3.0964, abs=1e-4)
     assert limit.reached == "below the bound, though small oscillations grow at 3.0964 to 3.1402"
+
+
+def test_every_window_is_tried_near_both_ends():
+    """In Morse's potential, ω = 3, kahan_li8 grows from 1.032 to 1.0467, and dissociates at 1.046 alone."""
+    system, start = systems.pendulum(), np.array([[0.01, 0.01]])
+    study = Study(
+        *(system, candidates(["kahan_li8"])[0], "float64", (0.0, 20.0)),
+        *(start, (), 1e3, 200, 5000),
+        small=small_oscillations(system, start[0], lambda: start),
+    )
+    start, stop, _ = study.linear.windows[0]
+    tried = [h for h in Search(study, [])._in_windows() if start < h < stop]
+    assert len(tried) == 4
+    assert tried[0] - start < 0.2 * (stop - start)
+    assert stop - tried[-1] < 0.02 * (stop - start)
+
+
+def test_an_unstable_step_that_was_asked_for_lowers_the_limit():
+    study = Study(
+        *(systems.pendulum(), candidates(["verlet"])[0], "float64", (0.0, 20.0)),
+        *(systems.pendulum().y0[None], (), 1e3, 200, 5000),
+    )
+    low, high, _ = Search(study, []).limit()
+    lower, bad, _ = Search(study, [0.3]).limit()
+    assert low > 1
+    assert 0.29 < lower < bad <= 0.3 < low < high
 
 
 def test_a_row_inside_a_window_says_so():

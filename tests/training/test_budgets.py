@@ -14,9 +14,10 @@ from sympflow.hamiltonian.hamiltonian import Hamiltonian
 from sympflow.kernels.network_tangents import NetworkTangents
 from sympflow.training import checkpoint as checkpoints
 from sympflow.training import starts, trials
+from sympflow.training.least_squares import STOPPED, levenberg_marquardt
 from sympflow.training.losses import Loss
 from sympflow.training.points import Labels
-from sympflow.training.session import Session
+from sympflow.training.session import OutOfTime, Session
 from sympflow.training.table_fit import TableFit, TableRun
 
 HH, PENDULUM = systems.henon_heiles(), systems.pendulum()
@@ -29,6 +30,31 @@ NETWORK = {"pairs": 1, "hidden": (4,), "points": 60, "validation_points": 60, "r
 
 
 # primed flows -------------------------------------------------------------------------------------------------
+
+
+def test_ctrl_c_ends_every_piece():
+    session = Session()
+    session.interruption.asked = True
+    with pytest.raises(OutOfTime):
+        session.deadline.part(0.5).check()
+
+
+def test_least_squares_that_are_cut_keep_what_they_have():
+    calls = []
+
+    def residuals(x):
+        calls.append(x)
+        if len(calls) > 7:
+            raise OutOfTime
+        return np.array([10 * (x[1] - x[0] ** 2), 1 - x[0]])
+
+    def linearized(x):
+        return np.array([10 * (x[1] - x[0] ** 2), 1 - x[0]]), np.array([[-20 * x[0], 10.0], [-1.0, 0.0]])
+
+    found = levenberg_marquardt(residuals, linearized, np.array([-1.2, 1.0]))
+    assert found.reason == STOPPED
+    assert found.cost < 24.2
+    assert found.iterations >= 1
 
 
 @pytest.mark.parametrize("what", [(TableFit, "residuals", 0.2), (TableFit, "model", 3.0)])

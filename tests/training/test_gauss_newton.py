@@ -14,7 +14,7 @@ from sympflow.training import trainer
 from sympflow.training.fits import PrimedFit
 from sympflow.training.least_squares import levenberg_marquardt
 from sympflow.training.points import Labels, Stream, states
-from sympflow.training.table_fit import Table, TableRun
+from sympflow.training.table_fit import Table, TableFit, TableRun
 from sympflow.training.table_step import TableStep
 
 HH, PENDULUM = systems.henon_heiles(), systems.pendulum()
@@ -277,6 +277,36 @@ def test_the_search_begins_where_residuals_are_finite():
 # processed flows --------------------------------------------------------------------------------------------------
 
 
+def test_the_search_keeps_to_where_residuals_are_finite():
+    def r(x):
+        with np.errstate(all="ignore"):
+            return np.array([np.log(x[0]) - 1.0])
+
+    found = levenberg_marquardt(r, lambda x: (r(x), 1 / x[:, None]), np.array([9.0]))
+    assert found.x[0] == pytest.approx(math.e)
+    assert levenberg_marquardt(r, None, np.array([-1.0])).cost == math.inf
+
+
+def test_a_trial_whose_squares_overflow_is_rejected_in_silence():
+    """A Gauss–Newton step from −6 goes to 396, where e^x is finite and its square is not."""
+
+    def r(x):
+        return np.exp(x) - 1.0
+
+    found = levenberg_marquardt(r, lambda x: (r(x), np.diag(np.exp(x))), np.array([-6.0]), damping=1e-12)
+    assert found.x[0] == pytest.approx(0.0, abs=1e-8)
+
+
+def test_a_degenerate_direction_does_no_harm():
+    found = levenberg_marquardt(
+        lambda x: np.array([x[0] + x[1] - 2.0, 0.0, 0.0]),
+        lambda x: (np.array([x[0] + x[1] - 2.0, 0.0, 0.0]), np.array([[1.0, 1.0, 0.0], [0] * 3, [0] * 3])),
+        np.zeros(3),
+    )
+    assert found.x.sum() == pytest.approx(2.0)
+    assert found.x[2] == 0
+
+
 def test_a_processor_pays():
     """At every time, and at no cost over a long run."""
     processed, plain = (
@@ -408,6 +438,26 @@ def test_a_fit_returns_nothing_worse_than_its_start():
         torch.testing.assert_close(flow.state_dict()[name], value, rtol=0, atol=1e-15)
     assert flow.recipe["stages"][-1]["kept_start"] is True
     assert flow.figures["one_step_error"] < 0.05
+
+
+def test_a_checkpoint_is_there_before_the_first_search_ends(tmp_path, monkeypatch):
+    """A run that is killed in its first search can be resumed, and ends as one that was not."""
+    path = tmp_path / "run.pt"
+    options = {"restarts": 2, "steps": 6, "points": 30, "reference_states": 10, "progress": False}
+    start = SympFlow.primed(PENDULUM, 2, dt=0.5)
+    whole = train(PENDULUM, flow=start, **options)
+
+    class Killed(BaseException):
+        pass
+
+    def kill(*_, **__):
+        raise Killed
+
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        patch.setattr(TableFit, "minimize", kill)
+        train(PENDULUM, flow=start, checkpoint=path, **options)
+    resumed = train(PENDULUM, flow=start, resume=path, **options)
+    assert all(torch.equal(v, resumed.state_dict()[k]) for k, v in whole.state_dict().items())
 
 
 @pytest.mark.parametrize(("symbolic", "starts"), [(True, 72), (False, 24)])

@@ -13,10 +13,11 @@ import torch
 
 from sympflow import HamiltonianSystem, SympFlow, systems, train
 from sympflow.training import trials
-from sympflow.training.fits import GaussNewton, SplitFit
+from sympflow.training.fits import GaussNewton, PrimedFit, SplitFit
 from sympflow.training.session import Session
 from sympflow.training.split_fit import SplitRun
-from sympflow.training.table_fit import TableFit
+from sympflow.training.starts import scaling_of
+from sympflow.training.table_fit import TableFit, TableRun
 from sympflow.workers import WorkerPool
 
 PENDULUM = systems.pendulum()
@@ -49,6 +50,21 @@ def test_trials_are_the_same_whatever_the_workers(monkeypatch):
         found = trials.chosen_trial(PENDULUM, PENDULUM.domain, Session(pool=WorkerPool(threads)))
     assert (found.start, found.error) == (alone.start, alone.error)
     assert same(found.flow, alone.flow)
+
+
+def test_fits_are_the_same_in_another_process():
+    """Their products are rounded by the order of arrays in memory, which a pickle must not change."""
+    few = {"points": 20, "label_times": 3, "reference_states": 5, "loss_points": 10, "matching_times": 2}
+    table = PrimedFit(loss="labels+residual", **few)
+    run = TableRun(FLOW, PENDULUM, PENDULUM.domain, scaling_of(PENDULUM.domain, FLOW.dt, 0), table)
+    theta = run.table.continued(run.frozen.coefficients(run.start_of(1))[0])
+    fits = [(run.frozen, run.start_of(1)), (run.weighted, run.start_of(0)), (run.whole, theta)]
+    for fit, x in fits:
+        for other in (pickle.loads(pickle.dumps(fit)), fit.own()):
+            assert all(np.array_equal(a, b) for a, b in zip(fit.linearized(x), other.linearized(x), strict=True))
+    run.table.assign(run.given)
+    run.whole.own().residuals(theta)
+    assert np.array_equal(run.table.parameters(), run.given)
 
 
 @pytest.mark.slow
