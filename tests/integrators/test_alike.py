@@ -28,7 +28,7 @@ def far(d):
 
 
 def bodies(n, dim):
-    """Of several kinds, in a box with a cut-off: written out or in memory."""
+    """Bodies of several kinds, in a box with a cut-off: written out or in memory."""
     rng = np.random.default_rng(dim)
     y0 = np.concatenate([rng.uniform(-9, 9, n * dim), rng.standard_normal(n * dim)])
     masses, kinds = rng.uniform(1, 2, n), {"c": rng.uniform(-1, 1, n)}

@@ -575,7 +575,7 @@ def test_bodies_without_mass_move_as_those_of_hardly_any(method):
 
 @pytest.mark.parametrize("method", ["wisdom_holman", "srkn11b", "gauss_legendre6", "rk4"])
 def test_forms_of_bodies_without_mass(method):
-    """That of the planets, and that of the others for given motions of these, each with momenta per unit mass."""
+    """Two forms are kept: one of the planets, and one of the others for given motions of these, per unit mass."""
     sol = solve(asteroids(), method, (0, 400.0), dt=40.0)
     keeps = method != "rk4"
     assert (sympflow.symplecticity_defect(sol) < 1e-12) == keeps

@@ -122,7 +122,7 @@ def test_nystrom_flag_says_whether_the_order_needs_a_quadratic_kinetic_energy(na
 
 @ALL
 def test_all_schemes_are_symmetric_and_have_an_inverse_that_has_one(scheme):
-    """That the inverse undoes the executed step, and the symmetric one is its own, are laws of all methods."""
+    """Other laws hold for all methods: the inverse undoes the executed step, that of a symmetric one is itself."""
     assert scheme.symmetric
     assert scheme.inverse().inverse().substeps == scheme.substeps
 
