@@ -7,6 +7,7 @@ import tracemalloc
 import numpy as np
 import pytest
 import torch
+from conftest import KINDS
 from scipy.integrate import solve_ivp
 
 from sympflow import HamiltonianSystem, SympFlow, get, solve, systems
@@ -182,8 +183,30 @@ def test_a_zero_between_the_samples_of_a_flow_is_found(rotation):
     np.testing.assert_allclose(sol.t_events[0], np.pi * (np.arange(20) + 0.5) / 7, atol=1e-12)
 
 
+@pytest.mark.parametrize("method", KINDS)
+@pytest.mark.parametrize("t_end", [8.0, -8.0])
+@pytest.mark.filterwarnings("ignore:`dt` .* is too long")
+def test_the_state_of_an_event_is_the_dense_output_there(method, t_end):
+    """For every kind of method; without end and with one."""
+    if method == "mlp" and t_end < 0:
+        return  # it has no inverse, so no backward time
+    for terminal in (None, 2):
+        g = event(lambda t, y: y[0] - 0.05, terminal=terminal)
+        sol = solve(HH, method, (0, t_end), events=g, dense_output=True, on_domain_exit="ignore", **loose(method))
+        assert sol.status == (0 if terminal is None else 1)
+        check_states_of_events(sol)
+
+
 def loose(method):
     return {"rtol": 1e-4, "atol": 1e-6} if method in ADAPTIVE else {}
+
+
+def check_states_of_events(sol):
+    assert sol.t_events[0].size >= 2
+    np.testing.assert_allclose(sol.sol(sol.t_events[0]).T, sol.y_events[0], rtol=0, atol=256 * EPS)
+    for t, y in zip(sol.t_events[0], sol.y_events[0], strict=True):
+        np.testing.assert_allclose(sol.sol(t), y, rtol=0, atol=256 * EPS)
+        assert abs(y[0] - 0.05) < 256 * EPS
 
 
 def test_events_of_tensors():

@@ -250,7 +250,7 @@ def test_it_is_symplectic_at_every_t(lawful):
     flow, x, _ = lawful
     J = canonical(flow.ndof)
     damping = flow.system.damping if flow.system is not None and flow.system.friction else 0.0
-    for t, row in zip(flow.dt * np.array([0.3, 2.6, -1.4]), x, strict=False):
+    for t, row in zip(flow.dt * np.array([0.3, 2.6, -1.4]), x[:3], strict=True):
         A = torch.autograd.functional.jacobian(lambda y, t=t: flow(t, y, **started(flow)), row)
         if np.ndim(damping):
             assert float(torch.linalg.det(A)) == pytest.approx(math.exp(-t * np.trace(damping)), rel=1e-13)

@@ -68,6 +68,10 @@ def test_values_are_those_of_scipy(name):
     q = np.random.default_rng(1).uniform(-1.9, 1.9, (200, d))
     expected = V(q)
     np.testing.assert_allclose(system.form.value(q), expected, rtol=0, atol=64 * EPS * np.abs(expected).max())
+    steps = 1e-5 * np.eye(d)
+    inside = q[np.abs(q).max(-1) < 1.5][:40]
+    slope = np.stack([(V(inside + h) - V(inside - h)) / 2e-5 for h in steps], axis=-1)
+    np.testing.assert_allclose(-system.force(inside), slope, rtol=0, atol=1e-7 * np.abs(slope).max())
 
 
 @pytest.mark.parametrize("method", ["verlet", "srkn14a", "gauss_legendre4", "rk4"])

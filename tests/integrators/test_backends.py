@@ -7,11 +7,32 @@ import torch
 from sympflow import HamiltonianSystem, solve, systems
 from sympflow.compiler import NotCompiled
 from sympflow.integrators.loops import compiled_loops
+from sympflow.schemes import SCHEMES
 
 HH = systems.henon_heiles()
 PLAIN = HamiltonianSystem(lambda q: np.median(q, axis=-1) ** 4, ndof=1, y0=[1.0, 0.0], gradient=lambda q: 4 * q**3)
 TRACED = HamiltonianSystem(lambda q: (q**4).sum(-1), ndof=1, y0=[1.0, 0.0])
 AIRY = HamiltonianSystem.from_sympy("p**2/2 - airyai(q)", y0=[1.0, 0.0])
+
+
+@pytest.mark.parametrize("method", sorted(SCHEMES))
+def test_evaluations_are_counted_as_they_are_made(method):
+    calls = {"force": 0, "hessian": 0}
+
+    def gradient(q):
+        calls["force"] += 1
+        return q**3
+
+    def hessian_vector(q, v):
+        calls["hessian"] += 1
+        return 3 * q**2 * v
+
+    system = HamiltonianSystem(
+        lambda q: (q**4).sum(-1) / 4, gradient=gradient, hessian_vector=hessian_vector, ndof=1, check=False
+    )
+    sol = solve(system, method, (0.0, 1.0), y0=[1.0, 0.0], dt=0.1)
+    assert sol.stats["force_evaluations"] == calls["force"]
+    assert sol.stats["hessian_evaluations"] == calls["hessian"]
 
 
 def test_the_compiled_count_merges_the_last_kick_with_the_next_first():

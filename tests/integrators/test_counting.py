@@ -7,11 +7,14 @@ from typing import ClassVar
 import numpy as np
 import pytest
 import torch
+from scipy.integrate import solve_ivp
 
-from sympflow import get, solve, systems
+from sympflow import available, get, solve, systems
 from sympflow.arrays import concatenate, per_state
 from sympflow.hamiltonian.system import counting_view
+from sympflow.integrators import base
 from sympflow.integrators.base import FixedStep
+from sympflow.interop.scipy import as_scipy
 
 HH, NONSEPARABLE = systems.henon_heiles(), systems.nonseparable()
 
@@ -49,12 +52,43 @@ def test_outputs_and_events_within_steps_are_counted_each():
     assert events.nfev >= 30 + 3
 
 
+def test_the_count_inside_scipy_is_that_of_its_solver():
+    sol = solve_ivp(HH, (0, 1), HH.y0, method=as_scipy(Ruth3(dt=0.1), HH), t_eval=[0.13, 1.0])
+    direct = solve_ivp(HH, (0, 1), HH.y0, method=as_scipy("verlet", HH, dt=0.1), t_eval=[0.13, 1.0])
+    assert 3 * 10 < sol.nfev < 3 * 30
+    assert direct.nfev < sol.nfev
+
+
 def test_a_step_that_is_overridden_is_counted_anew():
     class Twice(get("verlet")):
         def step(self, system, t, y, h):
             return super().step(system, t, super().step(system, t, y, h / 2), h / 2)
 
     assert solve(HH, Twice(dt=0.1), (0, 1)).nfev == 40
+
+
+def test_all_functions_of_the_system_are_counted_and_no_inner_call_twice():
+    counts: dict[str, int] = {}
+
+    def count(what, x):
+        counts[what] = counts.get(what, 0) + 1
+
+    view = counting_view(HH, count)
+    y = HH.y0
+    for value, expected in (
+        (view.force(y[:2]), HH.force(y[:2])),
+        (view.gradient(y), HH.gradient(y)),
+        (view.vector_field(y), HH.vector_field(y)),
+        (view(0.0, y), HH(0.0, y)),
+        (view.hessian(y), HH.hessian(y)),
+        (view.potential_hessian(y[:2]), HH.potential_hessian(y[:2])),
+        (view.hessian_vector(y[:2], y[2:]), HH.hessian_vector(y[:2], y[2:])),
+        (view.curvature_gradient(y[:2]), HH.curvature_gradient(y[:2])),
+    ):
+        np.testing.assert_array_equal(value, expected)
+    assert counts == {"force_evaluations": 4, "hessian_evaluations": 3, "curvature_evaluations": 1}
+    counting_view(NONSEPARABLE, count).vector_field(NONSEPARABLE.y0)
+    assert counts["force_evaluations"] == 5
 
 
 def test_a_view_passes_for_its_system():
@@ -67,6 +101,13 @@ def test_a_view_passes_for_its_system():
 
 
 # NumPy only ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", available())
+def test_what_the_built_in_methods_say_is_taken(name):
+    cls = get(name)
+    counts = issubclass(cls, FixedStep) and cls.own_stepper is FixedStep.own_stepper
+    assert not (counts and base._is_counted(cls))
 
 
 @dataclass(frozen=True)

@@ -472,7 +472,10 @@ SOLAR = systems.solar_system()
 
 def test_the_periods_and_momenta_of_the_solar_system():
     periods = SOLAR.local.frame.periods
-    assert np.allclose(periods, [87.97, 224.70, 365.26, 686.98, 4332.6, 10_759, 30_685, 60_189], rtol=7e-3)
+    means = np.array([87.9691, 224.7008, 365.2564, 686.9796, 4332.59, 10_759.2, 30_685.4, 60_189.0])
+    off = np.abs(periods / means - 1)
+    assert off[:4].max() < 2e-5
+    assert (off[4:] < [1e-3, 1e-2, 1e-2, 1e-2]).all()  # Jupiter and Saturn pull the outer ones off their means
     sol = solve(SOLAR, t_span=(0, 36_525.0))
     assert sol.integrator.name == "wisdom_holman"
     assert sol.integrator.corrector == 17

@@ -1,5 +1,6 @@
 """Limits of a training: a time budget that every piece of it keeps, memory, and a Δt that can be learnt."""
 
+import math
 import re
 import warnings
 
@@ -17,7 +18,7 @@ from sympflow.training import starts, trials
 from sympflow.training.least_squares import STOPPED, levenberg_marquardt
 from sympflow.training.losses import Loss
 from sympflow.training.points import Labels
-from sympflow.training.session import OutOfTime, Session
+from sympflow.training.session import LEAST_PART, OutOfTime, Session
 from sympflow.training.table_fit import TableFit, TableRun
 
 HH, PENDULUM = systems.henon_heiles(), systems.pendulum()
@@ -29,7 +30,19 @@ NETWORK = {"pairs": 1, "hidden": (4,), "points": 60, "validation_points": 60, "r
 # the deadline -------------------------------------------------------------------------------------------------
 
 
-# primed flows -------------------------------------------------------------------------------------------------
+def test_a_deadline_is_asked_between_steps_and_within_one(clock):
+    session = Session(time_budget=10.0)
+    whole = session.deadline
+    part, early = whole.part(0.5), whole.before(2.0)
+    assert (whole.left, part.left, early.left) == (10.0, 5.0, 8.0)
+    clock.now = 5.0
+    assert part.over()
+    assert session.cut
+    with pytest.raises(OutOfTime):
+        part.check()
+    assert not early.over()
+    assert whole.part(0.01).left == LEAST_PART
+    assert Session().deadline.part(0.1).left == math.inf
 
 
 def test_ctrl_c_ends_every_piece():
@@ -55,6 +68,9 @@ def test_least_squares_that_are_cut_keep_what_they_have():
     assert found.reason == STOPPED
     assert found.cost < 24.2
     assert found.iterations >= 1
+
+
+# primed flows -------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("what", [(TableFit, "residuals", 0.2), (TableFit, "model", 3.0)])
