@@ -16,7 +16,6 @@ from sympflow.integrators.interpolants import Interpolant, Piecewise
 from sympflow.integrators.tableaux import ADAPTIVE as TORCHDIFFEQ_ADAPTIVE
 from sympflow.kernels.explicit_loops import compiled_field
 
-pytestmark = pytest.mark.filterwarnings("ignore:`dt` .* is too long:RuntimeWarning")
 OSCILLATOR, HH = systems.harmonic_oscillator(), systems.henon_heiles()
 ADAPTIVE = ["rk45", "dop853", *TORCHDIFFEQ_ADAPTIVE]
 MULTISTEP = ["explicit_adams", "implicit_adams"]
@@ -71,6 +70,7 @@ class TestEveryMethod:
         assert np.abs(sol.y_events[0][:, 0]).max() < 1e-13  # at the zero of the dense output, to rounding
         assert (sol.status, sol.t.size) == (0, 0)
 
+    @pytest.mark.filterwarnings("ignore:`dt` .* is too long")
     def test_a_terminal_event_ends_the_solution_there(self, method):
         falling = event(zero_q, terminal=True, direction=-1)
         for t_end in (12, -12):
@@ -139,6 +139,7 @@ def test_a_false_of_numpy_does_not_end_the_solution():
     assert (sol.status, len(sol.t_events[0])) == (0, 3)
 
 
+@pytest.mark.filterwarnings("ignore:`dt` .* is too long")
 def test_of_several_events_in_a_step_the_first_terminal_one_counts():
     """One step of length 1; zeros at 0.3, 0.5 and 0.7, given out of order."""
     events = [
@@ -152,6 +153,7 @@ def test_of_several_events_in_a_step_the_first_terminal_one_counts():
     assert sol.y_events[0].shape == (0, 2)
 
 
+@pytest.mark.filterwarnings("ignore:`dt` .* is too long")
 def test_a_zero_on_a_step_counts_once_and_a_zero_at_the_start_counts():
     sol = solve(OSCILLATOR, "verlet", (0, 1), START, dt=0.25, events=[lambda t, y: t - 0.5, lambda t, y: t])
     assert [t.tolist() for t in sol.t_events] == [[0.5], [0.0]]

@@ -9,7 +9,6 @@ import pytest
 import sympflow
 from sympflow import HamiltonianSystem, solve
 
-pytestmark = pytest.mark.filterwarnings("ignore:`dt` .* is too long:RuntimeWarning")
 LAM = np.array([0.3, 0.0, 0.7, 0.3])
 
 
@@ -69,6 +68,7 @@ class TestTrajectories:
             np.testing.assert_allclose(sol.y[i], expected.y, rtol=0, atol=1e-14)
 
     @pytest.mark.slow
+    @pytest.mark.filterwarnings("ignore:`dt` .* is too long")
     def test_shapes_broadcast_with_those_of_the_states(self, system, y0):
         grid = {"lam": LAM[:, None], "m": [1.0, 2.0]}
         sol = solve(system, "verlet", (0, 1), params=grid, dt=0.25, dense_output=True)
@@ -149,6 +149,7 @@ class TestMetrics:
         ]
         np.testing.assert_allclose(metric(sol), each, rtol=1e-9, atol=1e-14)
 
+    @pytest.mark.filterwarnings("ignore:`dt` .* is too long")
     def test_a_loop_has_one_value(self):
         oscillator = HamiltonianSystem.from_sympy("p**2/2 + k*q**2/2", params={"k": 1.5})
         angle = np.linspace(0, 2 * np.pi, 16, endpoint=False)
