@@ -5,6 +5,7 @@
     python benchmarks/planets.py --long                            states after 100,000 years, and trained flows
     python benchmarks/planets.py --asteroids                       bodies without mass, on all cores
     python benchmarks/planets.py --secular                         secular frequencies from 20 million years, minutes
+    python benchmarks/planets.py --billion outer.store             a billion years of the outer planets, ten minutes
     python benchmarks/planets.py --figure docs/figures/planets.png eccentricities over 200,000 years
     python benchmarks/planets.py --belt docs/figures/belt.png      asteroids over 100,000 years, four minutes
 
@@ -360,6 +361,37 @@ def secular_table() -> str:
     return fragments.table(["", "four outer planets", "all eight", "Laskar"], rows)
 
 
+SPANS = 1e6, 1e7, 1e8, 1e9  # years
+
+
+def billion(store: Path, dt: float = 200.0) -> str:
+    """Errors of the outer planets over a billion years, compensated, and over the first tenth of it in plain numbers.
+
+    The scheme keeps the angular momentum exactly, so that its error is that of rounding.
+    """
+    system, lines = solar_system(OUTER), []
+    for title, spans, options in (
+        ("plain", SPANS[:-1], {}),
+        ("compensated", SPANS, {"compensated": True, "store": store}),
+    ):
+        every = 1000 * round(1e6 * YEAR / dt / 1000) // 10
+        n = round(spans[-1] / 1e5) * every
+        given = {"dt": dt, "corrector": 17, "save_every": every, "on_domain_exit": "ignore", **options}
+        seconds, sol = least(lambda given=given, n=n: solve(system, "wisdom_holman", (0.0, n * dt), **given), 1)
+        momentum = angular_momentum(sol.y.T, system)
+        turned = np.linalg.norm(momentum - momentum[0], axis=-1) / np.linalg.norm(momentum[0])
+        energy = np.abs(sol.energy_error())
+        for years in spans:
+            part = slice(1, 1 + round(years / 1e5))
+            worst, spread = energy[part].max(), np.sqrt(np.mean(turned[part] ** 2))
+            lines.append([title, f"{years:.0e}", f"{worst:.1e}", f"{spread:.1e}"])
+            print(*lines[-1], flush=True)
+        print(f"{title}: {seconds:.0f} s, {1e6 * seconds / n:.3f} µs a step, ends with status {sol.status}")
+        lines[-1].append(f"{seconds:.0f} s")
+    lines = [row + [""] * (5 - len(row)) for row in lines]
+    return fragments.table(["positions and velocities", "years", "energy error", "angular momentum, rms", "time"], lines)
+
+
 def figure(path: Path) -> None:
     """Eccentricities of the outer planets over 200,000 years."""
     import matplotlib
@@ -390,6 +422,7 @@ def main() -> None:
     parser.add_argument("--asteroids", action="store_true", help="measure bodies without mass on all cores")
     parser.add_argument("--long", action="store_true", help="compare states after 100,000 years, and trained flows")
     parser.add_argument("--secular", action="store_true", help="find the secular frequencies of the outer planets")
+    parser.add_argument("--billion", type=Path, metavar="STORE", help="run the outer planets over 1e9 years")
     parser.add_argument("--figure", type=Path, help="draw this picture, and nothing else")
     parser.add_argument("--belt", type=Path, help="draw that of asteroids, and nothing else")
     fragments.add_out(parser)
@@ -404,6 +437,9 @@ def main() -> None:
         text = secular_table()
         print(text)
         fragments.write(given.out, "planets-secular", text)
+        return
+    if given.billion:
+        fragments.write(given.out, "planets-billion", billion(given.billion))
         return
     if given.long:
         fragments.write(given.out, "planets-trained", trained())
