@@ -389,7 +389,9 @@ def billion(store: Path, dt: float = 200.0) -> str:
         print(f"{title}: {seconds:.0f} s, {1e6 * seconds / n:.3f} µs a step, ends with status {sol.status}")
         lines[-1].append(f"{seconds:.0f} s")
     lines = [row + [""] * (5 - len(row)) for row in lines]
-    return fragments.table(["positions and velocities", "years", "energy error", "angular momentum, rms", "time"], lines)
+    return fragments.table(
+        ["positions and velocities", "years", "energy error", "angular momentum, rms", "time"], lines
+    )
 
 
 def figure(path: Path) -> None:

@@ -91,18 +91,20 @@ def methods(
 
         if name is not None:
             cls = get(name)
-            cells = _cells(cls)
-            print_table((cls.name, ""), [*zip(TITLES, cells, strict=True), ("options", ", ".join(cls.options()))])
+            known = [*zip(TITLES, _cells(cls), strict=True), ("options", ", ".join(cls.options()))]
+            lines = [(title, textwrap.wrap(cell, LISTED - 18) or [""]) for title, cell in known]
+            rows = [(title * (k == 0), line) for title, cell in lines for k, line in enumerate(cell)]
+            print_table((cls.name, ""), rows)
             return
-        rows: list[tuple[str, ...]] = []
+        listed: list[tuple[str, ...]] = []
         for each in available():
             try:
                 cls = get(each)
             except ImportError as error:
-                rows.append((each, "", "", "", str(error)))
+                listed.append((each, "", "", "", str(error)))
                 continue
-            rows.append((each, *_cells(cls)))
-        print_table(("name", *TITLES), rows, width=LISTED)
+            listed.append((each, *_cells(cls)))
+        print_table(("name", *TITLES), listed, width=LISTED)
 
 
 TITLES = ("order", "symplectic", "forces a step", "source")

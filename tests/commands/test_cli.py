@@ -32,6 +32,9 @@ def test_lists_of_systems_and_methods():
     assert result.exit_code == 0
     assert "kahan_li8" in result.output
     assert "W. Kahan" in result.output
+    shown = run("methods", "kepler_takahashi_imada").output  # its sources are long
+    assert "H. Rein, D. Tamayo" in shown
+    assert max(map(len, shown.splitlines())) <= 120
 
 
 def test_one_system_is_shown_with_its_flows(tmp_path):
