@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
+from itertools import product
 from typing import Any, Self
 
 import numpy as np
@@ -42,18 +43,16 @@ MOON = 0.5  # of a Hill radius: bodies that are nearer may be bound
 
 
 def gravity(units: Any) -> float:
-    """Return G in units of length, time and mass, three names such as ("AU", "day", "solar mass")."""
-    names = [x.strip() for x in units.split(",")] if isinstance(units, str) else units
+    """Return G in units of length, time and mass, three names such as ("AU", "day", "solar mass"), or "SI"."""
+    names = "m, s, kg" if units == "SI" else units
+    names = [x.strip() for x in names.split(",")] if isinstance(names, str) else names
     tables = LENGTHS, TIMES, MASSES
-    if not isinstance(names, list | tuple) or len(names) != 3:
+    if not isinstance(names, list | tuple) or tuple(names) not in product(*tables):
+        known = "; ".join(", ".join(table) for table in tables)
         raise ValueError(
-            f"`units` must be names of a length, a time and a mass, such as 'AU, day, solar mass'; got {units!r}."
+            "`units` must be 'SI', or names of a length, a time and a mass, such as 'AU, day, solar mass'; got "
+            f"{units!r}. The names are {known}."
         )
-    for name, table in zip(names, tables, strict=True):
-        if not isinstance(name, str) or name not in table:
-            raise ValueError(
-                f"`units` has {name!r}, but the units are {', '.join(map(repr, table))}: take one of these."
-            )
     length, time, mass = (table[name] for name, table in zip(names, tables, strict=True))
     return mass * time**2 / length**3
 

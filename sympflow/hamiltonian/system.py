@@ -547,8 +547,8 @@ class HamiltonianSystem(Hamiltonian, Answering):
         G : float, optional
             The gravitational constant, by default 1.
         units : str or sequence of 3 str, optional
-            In place of G: names of a length ("AU", "km", "m"), a time ("day", "year", "s") and a mass ("solar mass",
-            "Jupiter mass", "Earth mass", "kg"), such as "AU, day, solar mass".
+            In place of G: "SI", or names of a length ("AU", "km", "m"), a time ("day", "year", "s") and a mass
+            ("solar mass", "Jupiter mass", "Earth mass", "kg"), such as "AU, day, solar mass".
         coordinates : {"jacobi", "democratic"}
             Inside of a run: each planet as seen from the centre of mass of all inside of its orbit, or, democratic
             heliocentric, from the star, where kicks hold the motion of the star and are less accurate.
