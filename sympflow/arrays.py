@@ -49,11 +49,7 @@ def copied(x: Array) -> Array:
 
 def library(x: Array) -> Any:
     """Return the module of the functions for `x`: NumPy or torch."""
-    if is_tensor(x):
-        import torch
-
-        return torch
-    return np
+    return sys.modules["torch"] if is_tensor(x) else np
 
 
 def library_name(x: Array) -> str:
@@ -95,9 +91,7 @@ def expanded(y: Array, shape: tuple[int, ...]) -> Array:
 
 def masked(y: Array, mask: Any, value: Any) -> Array:
     """Return y with a value, a number or an array like it, where the mask, which broadcasts against it, is True."""
-    if is_tensor(y):
-        mask = as_tensor(mask).to(y.device)
-    return library(y).where(mask, value, y)
+    return library(y).where(like(mask, y) != 0, value, y)
 
 
 def of_library(value: Any, like: Array) -> Array:
@@ -153,13 +147,9 @@ def differentiable(*arrays: Any) -> bool:
 
 def values(x: Any) -> np.ndarray | None:
     """Return the values of x, of a tensor (*lanes, *x.shape), lanes of vmap first; None where torch.compile traces."""
-    if not is_tensor(x):
-        return np.asarray(x)
-    if _is_plain(x):
-        return x.detach().cpu().numpy()
     plain, order = _behind(x)
-    if plain is None:
-        return None
+    if plain is None or isinstance(plain, np.ndarray):
+        return plain
     import torch
 
     with torch._C._DisableFuncTorch():
@@ -208,8 +198,6 @@ def lanes(x: Array) -> int:
 
 def readable(x: Array) -> bool:
     """Return True if the values of `x` are there, one for each entry: not under vmap, nor where a graph is traced."""
-    if _is_plain(x):
-        return True
     plain, order = _behind(x)
     return plain is not None and len(order) == x.ndim
 
@@ -219,16 +207,6 @@ def untransformed() -> AbstractContextManager[Any]:
     from torch._functorch.pyfunctorch import temporarily_clear_interpreter_stack
 
     return temporarily_clear_interpreter_stack()
-
-
-def _is_plain(x: Any) -> bool:
-    """True of an array, and of a tensor that stands for itself alone, as nearly all do."""
-    if not is_tensor(x):
-        return True
-    import torch
-
-    alone = torch._C._functorch.peek_interpreter_stack() is None  # else a function of x would be wrapped
-    return type(x) is torch.Tensor and alone and not torch.compiler.is_dynamo_compiling()
 
 
 def _behind(x: Any) -> tuple[Any, Sequence[int]]:
@@ -289,9 +267,7 @@ def finite_states(y: Array, *, in_any_lane: bool = False) -> np.ndarray:
 
     Tensors under `torch.func.vmap` are judged in all lanes, or in any; where there are no values, all states pass.
     """
-    if not is_tensor(y):
-        return np.isfinite(y).all(-1)
-    if y.device.type == "cpu" and (found := values(y)) is not None and found.ndim == y.ndim:
+    if str(y.device) == "cpu" and (found := values(y)) is not None and found.ndim == y.ndim:
         return np.isfinite(found).all(-1)
     finite = values(library(y).isfinite(y).all(-1))
     if finite is None:
@@ -306,10 +282,8 @@ def full_of_nan(y: Array) -> Array:
 
 
 def rows_of_nan(n: int, y: Array) -> Array:
-    """Return NaN for n states such as y, (n, ...), of an array with the n as its last axis but one in memory."""
-    if is_tensor(y):
-        return y.new_full((n, *y.shape), np.nan)
-    return np.moveaxis(np.full((*y.shape[:-1], n, y.shape[-1]), np.nan, dtype=y.dtype), -2, 0)
+    """Return NaN for n states such as y, (n, ...), with the n as the last axis but one in memory."""
+    return moveaxis(like(np.full((*y.shape[:-1], n, y.shape[-1]), np.nan), y), -2, 0)
 
 
 def with_rows(y: Array, rows: Any, values: Array) -> Array:

@@ -31,7 +31,6 @@ from sympflow.arrays import (
     differentiable,
     finite_states,
     full_of_nan,
-    is_tensor,
     known_finite,
     lanes,
     last,
@@ -464,7 +463,7 @@ def _solved_followed(integrator: Integrator, problem: Problem, action: str, rows
     followed = {name: rows.followed[name] if name in rows.followed else numbers[name] for name in rows.values}
     letters = None if problem.system.local is None else problem.system.local.letters(followed)
     if letters is not None:
-        followed = {name: x if is_tensor(x) else as_tensor(np.array(x)) for name, x in letters.items()}
+        followed = {name: as_tensor(x) for name, x in letters.items()}
     columns = [np.broadcast_to(to_numpy(value), rows.shape) for value in followed.values()]
     parameter_values = np.array([np.ravel(value) for value in columns])
     together = replace(problem, parameter_values=parameter_values, followed=followed, diagnosed=False)

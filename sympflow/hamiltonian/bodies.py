@@ -12,7 +12,7 @@ import numpy as np
 import sympy as sp
 
 from sympflow.arguments import check_kept, checked_count, checked_number, plain, real_array
-from sympflow.arrays import Array, is_tensor, like, masked, to_numpy
+from sympflow.arrays import Array, as_array, is_tensor, like, masked, to_numpy
 from sympflow.hamiltonian.jumps import check_continuous
 from sympflow.hamiltonian.local import LocalHamiltonian, check_memory, checked_params, named_values, numbered, parsed
 from sympflow.hamiltonian.poles import PairsPoles, Poles
@@ -168,8 +168,7 @@ class PairsHamiltonian(LocalHamiltonian):
         """Values of parameters, with those of `masses` (..., n) body by body."""
         found = dict(params)
         if "masses" in found and "masses" not in self.params:
-            masses = found.pop("masses")
-            masses = masses if is_tensor(masses) else np.asarray(masses)
+            masses = as_array(found.pop("masses"))
             if masses.ndim == 0 or masses.shape[-1] != self.n_bodies:
                 raise ValueError(
                     f"`params` has masses of shape {tuple(masses.shape)}: give one for each of the {self.n_bodies} "

@@ -217,14 +217,10 @@ class FlowSteps(ArraySteps):
         import torch
 
         if not is_tensor(y0):
-            inner = None if carry is None else RunCheckpoint()
             if carry is not None and carry.running is not None:
-                inner = RunCheckpoint(carry.steps, torch.from_numpy(carry.running))
+                carry.running = as_tensor(carry.running)
             with torch.no_grad():
-                whole = torch.from_numpy(np.ascontiguousarray(y0))
-                states, finite = self.rollout(whole, h, n_steps, save, t0, inner)
-            if carry is not None and inner is not None:
-                carry.advance(n_steps, to_numpy(inner.running))
+                states, finite = self.rollout(as_tensor(y0), h, n_steps, save, t0, carry)
             return to_numpy(states), finite
         flow, t = self.flow, abs(h)
         if not flow.symplectic:  # without an inverse: the call says so where h < 0

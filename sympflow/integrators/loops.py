@@ -68,10 +68,10 @@ def compiled_loops(
 
     Tensors need these, except on the CPU where the `system` is given.
     """
-    reason, tensor = None, is_tensor(y0)
+    reason = None
     if backend == "array":
         reason = "`backend` is 'array': choose 'auto'."
-    elif tensor:
+    elif is_tensor(y0):
         reason = _no_loops_for(y0, system)
     elif y0.dtype != np.float64:
         reason = f"`y0` is {y0.dtype}: use float64, or backend='array'."
@@ -79,7 +79,7 @@ def compiled_loops(
     if reason is None:
         try:
             loops = make()
-            if tensor and differentiable(y0):
+            if differentiable(y0):
                 loops.check_reverse()
             return loops
         except NotCompiled as error:

@@ -304,7 +304,7 @@ def check_applies(integrator: Integrator, system: HamiltonianSystem, y0: Array |
     mro = type(integrator).__mro__
     if system.external_force is not None and not (integrator.takes_forces and _speaks_itself(mro, "takes_friction")):
         system.check_conservative(f"which method {integrator.name!r} does not take", "")
-    if not system.conservative and not (integrator.takes_friction and _speaks_itself(mro, "takes_friction")):
+    if not (integrator.takes_friction and _speaks_itself(mro, "takes_friction")):
         what = "was trained without it" if integrator.trained else "does not take it"
         system.check_conservative(
             f"and method {integrator.name!r} {what}",
@@ -312,7 +312,7 @@ def check_applies(integrator: Integrator, system: HamiltonianSystem, y0: Array |
             "such as 'gauss_legendre6', or a Runge–Kutta method such as 'dop853' or 'dopri5', or solve the system "
             "that sympflow.doubled makes of it",
         )
-    if not system.autonomous and not (integrator.takes_driving and _speaks_itself(mro, "takes_driving")):
+    if not (integrator.takes_driving and _speaks_itself(mro, "takes_driving")):
         what = "was trained for a system without t" if integrator.trained else "does not take the time into account"
         system.check_autonomous(
             f"and method {integrator.name!r} {what}",

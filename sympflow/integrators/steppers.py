@@ -155,8 +155,8 @@ def rollout(
     k = 0
     if carry is not None and carry.running is not None:
         k, y = carry.steps, carry.running
-    tensor, position, wanted = is_tensor(y), 0, save.tolist()
-    out: Any = [full_of_nan(y)] * len(wanted) if tensor else np.full((len(wanted), *y.shape), np.nan, dtype=y.dtype)
+    position, wanted = 0, save.tolist()
+    out = [full_of_nan(y)] * len(wanted)
     finite = np.where(finite_states(y, in_any_lane=True), n_steps, -1)
     if wanted and wanted[0] == 0:
         out[0], position = copied(y), 1
@@ -166,7 +166,7 @@ def rollout(
             for k in range(start, min(start + block, n_steps)):
                 y = checked_state(step(k, y), y)
                 if position < len(wanted) and wanted[position] == k + 1:
-                    out[position] = copied(y) if tensor else y
+                    out[position] = copied(y)
                     position += 1
             k += 1
             failed = (finite == n_steps) & ~finite_states(y, in_any_lane=True)
@@ -178,9 +178,7 @@ def rollout(
                     finite = np.where(first, j, finite)
     if carry is not None:
         carry.advance(n_steps, y)
-    if tensor:
-        out = stack(out, axis=0) if out else y[None][:0]
-    return out, np.asarray(finite)
+    return stack(out, axis=0) if out else y[None][:0], np.asarray(finite)
 
 
 def checked_state(y_next: Any, y: Array) -> Array:

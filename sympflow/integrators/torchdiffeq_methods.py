@@ -16,7 +16,17 @@ from typing import Any, ClassVar
 import numpy as np
 
 from sympflow.arguments import check_dt
-from sympflow.arrays import Array, differentiable, full_of_nan, is_tensor, readable, stack, to_numpy, transformed
+from sympflow.arrays import (
+    Array,
+    as_tensor,
+    differentiable,
+    full_of_nan,
+    of_library,
+    readable,
+    stack,
+    to_numpy,
+    transformed,
+)
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep, OwnSteps, Recorder
 from sympflow.integrators.contract import (
@@ -48,7 +58,7 @@ class Trace:
     ) -> None:
         self.method, self.system, self.visit, self.t_span = method, system, visit, t_span
         self.direction = math.copysign(1.0, t_span[1] - t_span[0])
-        self.tensor = is_tensor(y0)
+        self.y0 = y0
         self.evaluations = self.n_steps = 0
         self.reached = t_span[0]
         self.last: Array | None = None  # the state at the beginning of the step that ended there
@@ -73,7 +83,7 @@ class Trace:
 
     def array(self, x: Any) -> Array:
         """A tensor of torchdiffeq's as what the user gave."""
-        return x if self.tensor else x.numpy()
+        return of_library(x, self.y0)
 
     def announce(self, step: Interpolant) -> None:
         self.n_steps += 1
@@ -188,8 +198,8 @@ class Watched(ByVectorField):
         trace.most_steps = self.max_num_steps if most_steps is None else most_steps
         if t_span[0] == t_span[1]:
             return trace, failure
-        y: Any = y0 if trace.tensor else torch.from_numpy(np.ascontiguousarray(y0))
-        with torch.set_grad_enabled(trace.tensor and torch.is_grad_enabled()), np.errstate(all="ignore"):
+        y = as_tensor(y0)
+        with torch.set_grad_enabled(y is y0 and torch.is_grad_enabled()), np.errstate(all="ignore"):
             try:
                 self.integrate(trace, y, abs(t_span[1] - t_span[0]))
             except _EndedError:

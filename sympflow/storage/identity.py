@@ -21,8 +21,6 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from sympflow.arrays import is_tensor
-
 PLAIN = (type(None), bool, int, float, complex, str, bytes, type(Ellipsis), type(NotImplemented))
 NAMED = (
     types.GetSetDescriptorType,
@@ -98,7 +96,7 @@ class _Contents:
         kind = type(value)
         if kind is np.ndarray or isinstance(value, np.generic):
             return self._array(np.asarray(value))
-        if is_tensor(value):
+        if isinstance(value, _of("torch", "Tensor")):
             return "tensor", str(value.dtype), *self._array(_numbers(value))
         if kind in (dict, OrderedDict, types.MappingProxyType):
             return "mapping", *self._items(value.items())
