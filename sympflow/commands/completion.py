@@ -30,6 +30,13 @@ def methods(incomplete: str) -> list[str]:
     return _last(incomplete, one_method)
 
 
+def metrics(incomplete: str) -> list[str]:
+    """Metrics of a comparison, separated by commas: of the last one."""
+    from sympflow.studies.comparison import METRICS
+
+    return several(METRICS)(incomplete)
+
+
 def flows(incomplete: str) -> list[str]:
     """Names of the flows that ship, and files of flows."""
     from sympflow.flow.shipped import shipped_flows

@@ -24,7 +24,6 @@ Methods = Annotated[
     ),
 ]
 Folder = Annotated[File, Option("--out", help="Folder for the figures, CSV and JSON.")]
-METRICS = ("error", "energy", "drift", "volume", "symplecticity", "reversal", "balance", "conformal")
 DIRECTIONS = {"up": 1, "down": -1, "both": 0}
 
 
@@ -42,7 +41,7 @@ def compare(
         Option(
             help="Any of error, energy, drift, volume, symplecticity, reversal; of driven systems balance, of damped "
             "ones conformal. Default: all that apply, but reversal.",
-            autocompletion=completion.several(METRICS),
+            autocompletion=completion.metrics,
         ),
     ] = None,
     n_outputs: Annotated[int, Option(help="Number of instants at which every method is measured.")] = 1000,

@@ -1,7 +1,7 @@
 """Attempts: a method run once under the conditions of a study, its failure caught, its measurements a row.
 
-Every study, `compare`, `work_precision` and `stability` alike, makes its rows of attempts. A metric is a function of an
-attempt that fills in its row, and a line in a study's table of metrics.
+Every study, `compare`, `work_precision` and `stability` alike, makes its rows of attempts. A metric is a line of
+`MEASURES`: a function of an attempt, the names of the figures that it gives, and the title of their column.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import numpy as np
 from sympflow.integrators.base import FixedStep, Integrator
 from sympflow.integrators.registry import build, name_of, naming_plugin
 from sympflow.metrics.accuracy import reference_error, time_reversal_error
-from sympflow.metrics.energy import energy_drift, energy_error, failed, largest, max_energy_error
+from sympflow.metrics.energy import energy_drift, energy_error, failed, largest
 from sympflow.metrics.energy_balance import energy_balance_error
 from sympflow.metrics.reference import Reference
 from sympflow.metrics.symplectic import conformal_defect, symplecticity_defect, volume_error
@@ -121,7 +121,7 @@ class Row:
     """The measurements of one method; None where a figure was not asked for, does not apply or could not be had.
 
     Errors, drift and defect are inf where the run became non-finite or could not be continued. The repr shows the
-    figures that are there.
+    figures that are there. Those of the metrics are attributes too: they are kept in `figures`, by their names.
 
     Attributes
     ----------
@@ -212,64 +212,21 @@ class Row:
     repeats: int = 0
     force_evaluations: float | None = None
     hessian_evaluations: float | None = None
-    error: float | None = None
-    energy_error: float | None = None
-    balance_error: float | None = None
-    energy_drift: float | None = None
-    energy_drift_error: float | None = None
     blow_up: float | None = None
     singular: bool | None = None
-    domain_exit: float | None = None
-    volume_error: float | None = None
-    symplecticity_defect: float | None = None
-    conformal_defect: float | None = None
-    time_reversal_error: float | None = None
     training_time: float | None = None
     break_even: float | None = None
+    figures: Mapping[str, float | None] = field(default_factory=dict)
+
+    def __getattr__(self, name: str) -> float | None:
+        if name not in FIGURES:
+            raise AttributeError(f"Row has no attribute {name!r}.", name=name, obj=self)
+        return self.figures.get(name)
 
     def __repr__(self) -> str:
-        figures = ((f.name, getattr(self, f.name), f.default) for f in fields(self))
-        filled = (f"{name}={value!r}" for name, value, default in figures if name == "status" or value != default)
-        return f"Row({', '.join(filled)})"
-
-
-NEGLIGIBLE = 0.1  # seconds of compilation that tables leave out
-CELLS: dict[str, Callable[[Any], str]] = {  # the cells of tables of rows, by the titles of their columns
-    "method": lambda row: row.label,
-    "batch": lambda row: f"{row.trajectories:,}",
-    "step": lambda row: plain(row.dt),
-    "rtol": lambda row: "" if row.tolerance is None else f"{row.tolerance:.0e}",
-    "backend": lambda row: row.backend or "",
-    "run time": lambda row: seconds(row.run_time),
-    "±": lambda row: seconds(row.run_time_spread),
-    "steps": lambda row: counted(row.n_steps),
-    "forces": lambda row: counted(row.force_evaluations),
-    "Hessians": lambda row: counted(row.hessian_evaluations),
-    "error": lambda row: number(row.error),
-    "energy error": lambda row: number(row.energy_error),
-    "energy balance": lambda row: number(row.balance_error),
-    "drift per unit t": lambda row: f"{number(row.energy_drift)} ± {number(row.energy_drift_error, 1)}".strip(" ±"),
-    "leaves domain at t": lambda row: plain(row.domain_exit),
-    "volume error": lambda row: number(row.volume_error),
-    "sympl. defect": lambda row: number(row.symplecticity_defect),
-    "conf. defect": lambda row: number(row.conformal_defect),
-    "reversal": lambda row: number(row.time_reversal_error),
-    "training": lambda row: seconds(row.training_time),
-    "compiled in": lambda row: seconds(row.compile_time) if (row.compile_time or 0.0) >= NEGLIGIBLE else "",
-    "status": lambda row: "" if row.status == "ok" else row.status,
-}
-
-
-def counted(x: float | None) -> str:
-    """A count: 12,000; empty for none."""
-    return f"{x:,.0f}" if x else ""
-
-
-def columns(rows: Sequence[Any], titles: Sequence[str], own: Mapping[str, Any] | None = None) -> list[Column]:
-    """Columns of these titles, with cells of `CELLS` or of their own."""
-    cells = CELLS | dict(own or {})
-    left = ("method", "backend", "status")
-    return [Column(title, [cells[title](row) for row in rows], title in left) for title in titles]
+        known = ((f.name, getattr(self, f.name), f.default) for f in fields(self) if f.name != "figures")
+        filled = {name: value for name, value, default in known if name == "status" or value != default}
+        return f"Row({', '.join(f'{name}={value!r}' for name, value in (filled | dict(self.figures)).items())})"
 
 
 @contextmanager
@@ -308,8 +265,12 @@ class Attempt:
         self.fill(reason=f"{self.row.reason} {text}".strip())
 
     def fill(self, **figures: Any) -> None:
-        """Enter figures in the row."""
+        """Enter facts in the row."""
         self.row = replace(self.row, **figures)
+
+    def enter(self, **figures: float | None) -> None:
+        """Enter figures of metrics in the row."""
+        self.fill(figures={**self.row.figures, **figures})
 
     def run(self, run: Callable[[Any], Solution | Sequence[Solution]]) -> None:
         """Run the candidate's integrator once, and enter its counts; or the reason why there is no solution."""
@@ -363,15 +324,16 @@ class Attempt:
         except Exception:  # the run itself says why
             return
 
-    def measure(self, metrics: Mapping[str, Metric], asked: Sequence[str]) -> None:
-        """Fill in the metrics asked for; one that cannot be had leaves a note, and so does a RuntimeWarning."""
+    def measure(self, asked: Sequence[str], metrics: Mapping[str, Measure] | None = None) -> None:
+        """Enter the metrics asked for; one that cannot be had leaves a note, and so does a RuntimeWarning."""
         if self.sol is None:
             return
         for name in asked:
+            metric = (metrics or MEASURES)[name]
             with self.noting_warnings():
                 try:
                     with naming_plugin(self.sol.integrator, passes=(TypeError, ValueError)):  # these say that it cannot
-                        metrics[name](self)
+                        self.enter(**dict(zip(metric.figures, np.atleast_1d(metric.of(self)).tolist(), strict=True)))
                 except Exception as error:
                     self.note(f"No {name}: {error}")
 
@@ -388,69 +350,121 @@ class Attempt:
 
 # metrics ----------------------------------------------------------------------------------------------------------
 
-Metric = Callable[[Attempt], None]  # a function that measures an attempt which has run, and fills in its row
+
+@dataclass(frozen=True)
+class Measure:
+    """A metric of attempts: the title of its column, the names of its figures, and a function that gives these."""
+
+    title: str
+    figures: tuple[str, ...]  # the second, if any, is the uncertainty of the first
+    of: Callable[[Attempt], Any]
+
+    def cell(self, row: Row) -> str:
+        """The figures of a row in a table."""
+        values = zip(map(row.__getattr__, self.figures), (2, 1), strict=False)
+        return " ± ".join(number(x, digits) for x, digits in values if x is not None)
 
 
 def accuracy(attempt: Attempt, truth: Reference) -> None:
     """The distance from a reference; of a batch of which fewer trajectories were run, from their part of it."""
     (sol,) = attempt.sols
     states = truth if sol.y.shape[:-1] == truth.y.shape[:-1] else truth.y[: len(sol.y0)]
-    attempt.fill(error=float(np.median(largest(reference_error(sol, states), sol))))
+    attempt.enter(error=float(np.median(largest(reference_error(sol, states), sol))))
 
 
-def energy(attempt: Attempt) -> None:
-    """The energy error over time, and its maximum."""
+def energy(attempt: Attempt, of: Callable[[Solution], np.ndarray]) -> float:
+    """The error of the energy, or of its balance, over time, and its maximum."""
     (sol,) = attempt.sols
-    attempt.energy = np.abs(energy_error(sol))
-    attempt.fill(energy_error=float(np.median(max_energy_error(sol))))
+    attempt.energy = series = np.abs(of(sol))
+    return float(np.median(largest(series, sol)))
 
 
-def balance(attempt: Attempt) -> None:
-    """The error of the energy balance over time, and its maximum."""
-    (sol,) = attempt.sols
-    attempt.energy = series = energy_balance_error(sol, relative=True)
-    attempt.fill(balance_error=float(np.median(largest(series, sol))))
-
-
-def drift(attempt: Attempt) -> None:
+def drift(attempt: Attempt) -> tuple[float, float]:
     """The trend of the energy error: the median slope over all trajectories, with its own standard error."""
     if attempt.lost:
-        attempt.fill(energy_drift=np.inf, energy_drift_error=np.inf)
-        return
+        return np.inf, np.inf
     drifts = [energy_drift(sol) for sol in attempt.sols]
     slope = np.concatenate([np.ravel(d.slope) for d in drifts])
     uncertainty = np.concatenate([np.ravel(d.standard_error) for d in drifts])
     middle = int(np.argsort(slope)[len(slope) // 2])
-    attempt.fill(energy_drift=float(slope[middle]), energy_drift_error=float(uncertainty[middle]))
+    return float(slope[middle]), float(uncertainty[middle])
 
 
-def volume(attempt: Attempt) -> None:
+def volume(attempt: Attempt) -> float:
     """The volume error over time, and the last value that is largest in magnitude."""
     (sol,) = attempt.sols
     if attempt.lost:
-        attempt.fill(volume_error=np.inf)
-        return
+        return np.inf
     attempt.volume = series = np.asarray(volume_error(sol, over_time=True))
     last = np.ravel(np.where(failed(sol), np.inf, series[..., -1]))
-    attempt.fill(volume_error=float(last[np.argmax(np.abs(last))]))
+    return float(last[np.argmax(np.abs(last))])
 
 
-def defect(attempt: Attempt, of: Callable[..., Any]) -> None:
+def defect(attempt: Attempt, of: Callable[..., Any]) -> float:
     """The largest defect of a step, relative to the step's norm: of `symplecticity_defect` or `conformal_defect`."""
     (sol,) = attempt.sols
-    attempt.fill(**{of.__name__: np.inf if attempt.lost else float(np.max(of(sol, relative=True)))})
+    return np.inf if attempt.lost else float(np.max(of(sol, relative=True)))
 
 
-symplecticity, conformality = (partial(defect, of=of) for of in (symplecticity_defect, conformal_defect))
-
-
-def reversal(attempt: Attempt) -> None:
+def reversal(attempt: Attempt) -> float | None:
     """The error of returning to the start."""
     (sol,) = attempt.sols
     try:
-        attempt.fill(time_reversal_error=float(np.median(time_reversal_error(sol))))
+        return float(np.median(time_reversal_error(sol)))
     except TypeError:
         attempt.note(f"No reversal: method {attempt.row.method!r} cannot run backwards in time.")
+        return None
+
+
+MEASURES = {  # the metrics by their names, in the order of their columns
+    "energy": Measure("energy error", ("energy_error",), partial(energy, of=energy_error)),
+    "balance": Measure(
+        "energy balance", ("balance_error",), partial(energy, of=partial(energy_balance_error, relative=True))
+    ),
+    "drift": Measure("drift per unit t", ("energy_drift", "energy_drift_error"), drift),
+    "volume": Measure("volume error", ("volume_error",), volume),
+    "symplecticity": Measure("sympl. defect", ("symplecticity_defect",), partial(defect, of=symplecticity_defect)),
+    "conformal": Measure("conf. defect", ("conformal_defect",), partial(defect, of=conformal_defect)),
+    "reversal": Measure("reversal", ("time_reversal_error",), reversal),
+}
+OF_MEASURES = tuple(name for measure in MEASURES.values() for name in measure.figures)
+FIGURES = {"error", "domain_exit", *OF_MEASURES}
+"""The attributes of rows that are figures of metrics."""
+
+
+# tables -----------------------------------------------------------------------------------------------------------
+
+NEGLIGIBLE = 0.1  # seconds of compilation that tables leave out
+CELLS: dict[str, Callable[[Any], str]] = {  # the cells of tables of rows, by the titles of their columns
+    "method": lambda row: row.label,
+    "batch": lambda row: f"{row.trajectories:,}",
+    "step": lambda row: plain(row.dt),
+    "rtol": lambda row: "" if row.tolerance is None else f"{row.tolerance:.0e}",
+    "backend": lambda row: row.backend or "",
+    "run time": lambda row: seconds(row.run_time),
+    "±": lambda row: seconds(row.run_time_spread),
+    "steps": lambda row: counted(row.n_steps),
+    "forces": lambda row: counted(row.force_evaluations),
+    "Hessians": lambda row: counted(row.hessian_evaluations),
+    "error": lambda row: number(row.error),
+    "leaves domain at t": lambda row: plain(row.domain_exit),
+    **{measure.title: measure.cell for measure in MEASURES.values()},
+    "training": lambda row: seconds(row.training_time),
+    "compiled in": lambda row: seconds(row.compile_time) if (row.compile_time or 0.0) >= NEGLIGIBLE else "",
+    "status": lambda row: "" if row.status == "ok" else row.status,
+}
+
+
+def counted(x: float | None) -> str:
+    """A count: 12,000; empty for none."""
+    return f"{x:,.0f}" if x else ""
+
+
+def columns(rows: Sequence[Any], titles: Sequence[str], own: Mapping[str, Any] | None = None) -> list[Column]:
+    """Columns of these titles, with cells of `CELLS` or of their own."""
+    cells = CELLS | dict(own or {})
+    left = ("method", "backend", "status")
+    return [Column(title, [cells[title](row) for row in rows], title in left) for title in titles]
 
 
 # run times --------------------------------------------------------------------------------------------------------

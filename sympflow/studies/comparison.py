@@ -26,22 +26,23 @@ from sympflow.metrics.reference import reference as compute_reference
 from sympflow.solution import Solution
 from sympflow.solver import solve
 from sympflow.studies import attempts
-from sympflow.studies.attempts import CELLS, Attempt, Candidate, Metric, Row, candidates, interleaved, tolerance_of
+from sympflow.studies.attempts import (
+    CELLS,
+    MEASURES,
+    OF_MEASURES,
+    Attempt,
+    Candidate,
+    Row,
+    candidates,
+    interleaved,
+    tolerance_of,
+)
 from sympflow.studies.reports import Column, Report, described, seconds, text_table
 from sympflow.systems.given import GivenSystem, given_system
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-MEASURES: dict[str, Metric] = {
-    "energy": attempts.energy,
-    "drift": attempts.drift,
-    "volume": attempts.volume,
-    "symplecticity": attempts.symplecticity,
-    "reversal": attempts.reversal,
-    "balance": attempts.balance,
-    "conformal": attempts.conformality,
-}
 METRICS = ("error", *MEASURES)
 MATCHES = ("time", "evaluations", "energy_error")
 PAPER = ("sympflow", "mlp", "verlet", "leapfrog", "rk45")
@@ -156,7 +157,7 @@ def compare(
     for one in runs:
         if one.sol is not None:
             say(f"{system.name}: measuring {one.candidate.label}")
-            one.measure(MEASURES, [metric for metric in asked if metric in MEASURES])
+            one.measure([metric for metric in asked if metric in MEASURES])
     return Comparison(system, (t0, t1), start, t, asked, repeats, match, truth, tuple(runs))
 
 
@@ -377,9 +378,7 @@ class Comparison(Report):
 
     columns: ClassVar[tuple[str, ...]] = (
         *("system", "method", "label", "status", "reason", "dt", "tolerance", "backend", "run_time", "run_time_spread"),
-        *("compile_time", "force_evaluations", "hessian_evaluations", "error", "energy_error", "balance_error"),
-        *("energy_drift", "energy_drift_error", "volume_error", "symplecticity_defect", "conformal_defect"),
-        *("time_reversal_error", "training_time"),
+        *("compile_time", "force_evaluations", "hessian_evaluations", "error", *OF_MEASURES, "training_time"),
     )
 
     system: HamiltonianSystem

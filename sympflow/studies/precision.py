@@ -162,9 +162,6 @@ def measure_of(system: HamiltonianSystem) -> str:
     return f"{kept_by(system)}_error".removeprefix("_")
 
 
-_KEPT: dict[str, attempts.Metric] = {"energy_error": attempts.energy, "balance_error": attempts.balance}
-
-
 @dataclass(frozen=True)
 class Conditions:
     """One set of initial states, the interval and the instants, under which every point is run."""
@@ -206,7 +203,7 @@ def _measure(
     say(f"{scene}: reference")
     truth, problem = _reference(conditions)
     resolved = MARGIN * (0.0 if truth is None or truth.accuracy is None else truth.accuracy)
-    floor = FLOOR if conditions.measure in _KEPT else max(FLOOR, resolved)
+    floor = FLOOR if kept_by(conditions.system) else max(FLOOR, resolved)
     points: list[Attempt] = []
     for candidate, integrators in swept:
         say(f"{scene}: {candidate.label}")
@@ -274,8 +271,7 @@ def _first(candidate: Candidate, conditions: Conditions, compile_time: float | N
         force_evaluations=sol.stats["force_evaluations"] / share,
         hessian_evaluations=sol.stats["hessian_evaluations"] / share,
     )
-    if conditions.measure in _KEPT:
-        point.measure({"energy": _KEPT[conditions.measure]}, ["energy"])
+    point.measure([name for name in (kept_by(conditions.system),) if name])
     return point
 
 

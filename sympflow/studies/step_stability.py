@@ -34,7 +34,7 @@ from sympflow.show.style import saved
 from sympflow.solution import Solution
 from sympflow.solver import solve
 from sympflow.studies import attempts
-from sympflow.studies.attempts import Attempt, Candidate, Metric, Row, candidates
+from sympflow.studies.attempts import MEASURES, Attempt, Candidate, Measure, Row, candidates
 from sympflow.studies.reports import Column, Report, described, number, plain, records, text_table
 from sympflow.systems.given import GivenSystem, given_system
 
@@ -318,7 +318,7 @@ class Study:
         if one.sol is not None:
             with one.noting_warnings():
                 worst = [float(np.max(max_energy_error(sol))) for sol in one.sols]
-                one.fill(energy_error=math.inf if any(map(math.isnan, worst)) else max(worst))
+                one.enter(energy_error=math.inf if any(map(math.isnan, worst)) else max(worst))
             status, words = self.verdict(one)
             one.fill(status=status, reason=f"{one.row.reason} {words}".strip())
         return one
@@ -354,7 +354,7 @@ class Study:
         one = self.attempt(h, self.span(h))
         if one.sol is not None:
             _note_blow_up(one)
-            one.measure(MEASURES, self.metrics)
+            one.measure([name for name in self.metrics if name != "energy"], OF_RUNS)
             window = None if h is None or self.linear is None else self.linear.window_of(h)
             if window is not None and one.row.status in STABLE and self.small and self.small.equilibrium is not None:
                 by = "without bound" if window.growth == math.inf else f"by up to a factor {window.growth:.5g}"
@@ -392,9 +392,10 @@ def domain_exit(sols: Sequence[Solution]) -> float | None:
 # metrics: those of attempts, of as much of the runs as they need here -----------------------------------------------
 
 
-def _drift(one: Attempt) -> None:
-    if one.row.status != "unstable" and len(one.sols[0].t) >= FEWEST_FOR_DRIFT:
-        attempts.drift(one)
+def _drift(one: Attempt) -> tuple[float | None, float | None]:
+    if one.row.status == "unstable" or len(one.sols[0].t) < FEWEST_FOR_DRIFT:
+        return None, None
+    return attempts.drift(one)
 
 
 def _first_steps(one: Attempt) -> Solution:
@@ -408,14 +409,13 @@ def _first_steps(one: Attempt) -> Solution:
         return solve(sol.system, sol.integrator, (t0, t1), y0, dtype=str(y0.dtype), on_domain_exit="ignore")
 
 
-MEASURES: dict[str, Metric] = {
-    "energy": lambda one: None,  # of every run, for its status depends on it
-    "drift": _drift,
-    "volume": lambda one: one.fill(volume_error=abs(float(volume_error(_first_steps(one))))),
-    "symplecticity": lambda one: one.fill(
-        symplecticity_defect=float(symplecticity_defect(_first_steps(one), relative=True))
+OF_RUNS = {  # the energy error is that of every run, for its status depends on it
+    "drift": replace(MEASURES["drift"], of=_drift),
+    "volume": replace(MEASURES["volume"], of=lambda one: abs(float(volume_error(_first_steps(one))))),
+    "symplecticity": replace(
+        MEASURES["symplecticity"], of=lambda one: float(symplecticity_defect(_first_steps(one), relative=True))
     ),
-    "domain": lambda one: one.fill(domain_exit=domain_exit(one.sols)),
+    "domain": Measure("leaves domain at t", ("domain_exit",), lambda one: domain_exit(one.sols)),
 }
 
 

@@ -85,16 +85,17 @@ def test_files_table_and_figure(report, tmp_path):
 
 
 def test_cost_is_interpolated_between_points_of_a_power_law():
-    law = [Row("s", "m", "m", energy_error=e, run_time=e**-0.5) for e in (1e-2, 1e-4, 1e-6)]
+    law = [Row("s", "m", "m", run_time=e**-0.5, figures={"energy_error": e}) for e in (1e-2, 1e-4, 1e-6)]
     assert cost_at(law, 1e-3) == pytest.approx(1e-3**-0.5)
     assert cost_at(law, 1.0) == pytest.approx(10)  # nothing cheaper is known
     assert cost_at(law, 1e-7) == math.inf
 
 
 def test_training_has_paid_for_itself_when_the_time_saved_is_that_of_training():
-    rival = [Row("s", "verlet", "verlet", energy_error=e, run_time=0.01 / e) for e in (1e-2, 1e-4)]
-    flow = Row("s", "sympflow", "sympflow", energy_error=1e-3, run_time=4.0, training_time=60.0)
-    slow = Row("s", "sympflow", "slow", energy_error=1e-3, run_time=40.0, training_time=60.0)
+    rival = [Row("s", "verlet", "verlet", run_time=0.01 / e, figures={"energy_error": e}) for e in (1e-2, 1e-4)]
+    figures = {"energy_error": 1e-3}
+    flow = Row("s", "sympflow", "sympflow", run_time=4.0, training_time=60.0, figures=figures)
+    slow = Row("s", "sympflow", "slow", run_time=40.0, training_time=60.0, figures=figures)
     *_, quick, never = break_even([*rival, flow, slow], length=100.0)
     assert quick.break_even == pytest.approx(60 / ((10 - 4) / 100))
     assert never.break_even == math.inf
