@@ -15,13 +15,16 @@ from sympflow.flow.tables import Tables
 from sympflow.hamiltonian.collocation import Tableau
 from sympflow.hamiltonian.parts import ExactParts
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.kernels.protocol import Kernel, Run, RunCheckpoint, Steps, Task, both_ways, run_states
+from sympflow.kernels.protocol import Kernel, Run, RunCheckpoint, Steps, Task, begun_in, both_ways, run_states
 from sympflow.kernels.splitting_loops import SplittingKernel, splitting_loops
 from sympflow.kernels.stages import StageTable, run_table, single_table, with_last_stage
 from sympflow.schemes import CURVATURE, Scheme
 
 if TYPE_CHECKING:
+    from sympflow.kernels.reverse import Between, Recorded
     from sympflow.kernels.rollouts import SplittingRollouts
+
+ONE = np.ones(1, dtype=np.int64)
 
 __all__ = ["ClockedFlowKernel", "CollocatedFlowKernel", "PrimedFlowKernel", "SplitFlowKernel"]
 
@@ -54,6 +57,36 @@ class PrimedFlowKernel(Kernel):
         work = stages * size / 2 / (self._splitting.abreast if N > 1 else 1.0)
         rollout = partial(self._functions().run_processed, *tables)
         return run_states(rollout, task, size * (1 + self._compensated), work)
+
+    def check_reverse(self) -> None:
+        self._functions().check_reverse()
+        if self._tables.processed and self._splitting.friction:
+            super().check_reverse()
+
+    def recorded(self, task: Task) -> Between | Recorded:
+        if not self._tables.processed:
+            return self._kernel(task.h).recorded(task._replace(h=abs(task.h)))
+        from sympflow.kernels.reverse import Between, Recorded
+
+        code: Any = self._functions()
+        later = task.save[begun_in(task.save) :]
+        tables, size = self._processed(task.h, task.t0), task.y0.shape[1]
+        before, after = (code.unclosed(tables[i], 2) for i in (0, 2))
+        work = self._splitting.work
+        first = Recorded(code, before, task.y0, 1, ONE, before.shape[1] * work)
+        steps = code.unclosed(tables[1])
+        run = Recorded(code, steps, first.states[:, 0], task.n_steps, later, steps.shape[1] * work)
+        rows = run.states.reshape(-1, size)
+        if self._splitting.driven:
+            after = code.shifted(after, later)
+            rows = np.column_stack([rows, np.tile(np.arange(float(len(later))), len(task.y0))])
+        last = Recorded(code, after, rows, 1, ONE, work)
+
+        def out(x: np.ndarray) -> np.ndarray:
+            return last.pulled(x.reshape(-1, 1, size), False)[0].reshape(x.shape)
+
+        states = last.states.reshape(run.states.shape)
+        return Between(task, run, states, out, lambda x: first.pulled(x[:, None], False)[0])
 
     def step(self, h: ArrayLike, y: np.ndarray, t: ArrayLike = 0.0) -> Steps:
         """ψ̄_h of each row of `y` (N, 2d), each with its own h (N,), of a driven system at the times t."""
@@ -134,6 +167,12 @@ class SplitFlowKernel(Kernel):
 
     def runs(self, task: Task) -> Run:
         return self._kernel.runs(task)
+
+    def check_reverse(self) -> None:
+        self._kernel.check_reverse()
+
+    def recorded(self, task: Task) -> Between:
+        return self._kernel.recorded(task)
 
     def step(self, h: ArrayLike, y: np.ndarray, t: ArrayLike = 0.0) -> Steps:
         lengths = np.broadcast_to(np.asarray(h, dtype=np.float64), y.shape[:1])

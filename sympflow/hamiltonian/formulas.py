@@ -445,8 +445,8 @@ class TracedLetters:
         self.given = (*form.parameters, *self.letters)
 
     def at(self, t: Any, parameters: Sequence[Any]) -> list[Any]:
-        """The coefficients at times t, numbers of compiled code."""
-        return [t.code.operand(x, t.type) for x in _at_time(self.letters, t)]
+        """The coefficients at times t."""
+        return _at_time(self.letters, t)
 
 
 def _at_time(coefficients: Mapping[Variable, Formula], time: Any) -> list[Any]:

@@ -16,6 +16,7 @@ from sympflow.compiler.functions import added, fma
 from sympflow.compiler.program import gradient, traced
 from sympflow.hamiltonian.formulas import Variable
 from sympflow.hamiltonian.monomials import Monomials
+from sympflow.kernels.rollouts import SplittingRollouts
 from sympflow.kernels.runs import Room
 from sympflow.kernels.splittings import Splitting, SplittingCode
 
@@ -198,6 +199,9 @@ class ArrayCode(SplittingCode):
         names = self._splitting.numbers
         same = traced(lambda *x: x, *names)
         return [Arranged(same, same) for _ in self._splitting.terms]
+
+    def check_reverse(self) -> None:
+        SplittingRollouts.check_reverse(self)
 
     def _executed(self, k: int, room: Room, column: Sequence[Any]) -> None:
         self.kicked(room, self._splitting.terms[k], column)

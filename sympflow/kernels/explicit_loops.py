@@ -10,12 +10,12 @@ from typing import Any, Protocol
 import numpy as np
 
 from sympflow.compiler import NotCompiled
-from sympflow.compiler.control import DOUBLE, POINTER, Code, Rows, Value
-from sympflow.compiler.program import Program, adjoint, gradient, traced
+from sympflow.compiler.control import DOUBLE, POINTER, Rows, Value
+from sympflow.compiler.program import Program, gradient
 from sympflow.hamiltonian.formulas import Variable, recorded
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.one_steps import OneStep, OneStepKernel, is_large, lettered, parametric, shared_code, terms_of
-from sympflow.kernels.runs import Numbers, Room, Values, begun, finished
+from sympflow.kernels.runs import Numbers, Room, begun, finished
 from sympflow.lazy import kept
 
 __all__ = ["CompiledField", "compiled_field", "explicit_kernel"]
@@ -107,7 +107,7 @@ class Field:
         if self.large:
             letters = code.at(room, n)
             for i, x in enumerate(given):
-                code.store(x, letters, i)
+                code.store(code.operand(x, DOUBLE), letters, i)
             arrays = [code.load(data, i, POINTER) for i in range(len(self.data))]
             code.outlined("field", [y, out, room, letters, *arrays], self.fill, rare=False)
         else:
@@ -156,44 +156,22 @@ class _InRegisters(_Explicit):
     lanes = 8
 
     def stage(self, values: list[Value], numbers: Numbers, kind: Value, step: Value) -> list[Value]:
-        return self._advanced(*values, *self._numbers(numbers, values[0].code, step))
+        code, type = step.code, values[0].type
+        column, whole = [numbers(i) for i in range(self.size)], code.convert("sitofp", step, "double")
+        return [code.operand(x, type) for x in self.plain(0, values, column, whole)]
 
-    def _numbers(self, numbers: Numbers, code: Code, step: Value) -> list[Value]:
-        """The numbers of a step: h, the parameters, the letters at each stage, the rates."""
-        column = self.column(code, numbers, step)
-        letters = [x for row in self.A for x in self.letters_at(column, sum(row))]
-        return [*column[: 1 + self.parameters], *letters, *column[self.size - len(self.field.rates) :]]
-
-    def _advanced(self, *numbers: Any) -> list[Any]:
-        """The state after a step, from the state and the numbers of a step."""
-        n, at = self.n_out, self.n_out + 1 + self.parameters
-        y, h, parameters = numbers[:n], numbers[n], numbers[n + 1 : at]
-        count = len(self.lettered.letters)
-        rates = numbers[at + count * len(self.A) :]
+    def plain(self, kind: int, state: Sequence[Any], column: Sequence[Any], step: Any) -> Sequence[Any]:
+        column = self.begun(column, step)
+        given, rates = column[1 : 1 + self.parameters], column[self.size - len(self.field.rates) :]
         K: list[list[Any]] = []
-        for i, row in enumerate(self.A):
-            letters = numbers[at + i * count :][:count]
-            K.append(self.field.program(*_moved(y, h, row, K), *parameters, *letters, *rates))
-        return _moved(y, h, self.B, K)
-
-    @cached_property
-    def _reverse(self) -> Program:
-        """The cotangents of what a step is made of, from that, and from the cotangents of the state after it."""
-        count = self.n_out + 1 + self.parameters + len(self.lettered.letters) * len(self.A) + len(self.field.rates)
-        return adjoint(traced(self._advanced, *(f"x_{i}" for i in range(count))))
+        for row in self.A:
+            letters = self.letters_at(column, sum(row))
+            K.append(self.field.program(*_moved(state, column[0], row, K), *given, *letters, *rates))
+        return _moved(state, column[0], self.B, K)
 
     @property
     def reversible(self) -> bool:  # type: ignore[override]
         return len(self.field.program) * len(self.A) <= MOST_REVERSED
-
-    def adjoint(
-        self, values: Values, cotangents: Values, numbers: Numbers, kind: Value, step: Value, slopes: bool, *room: Room
-    ) -> tuple[Values, Values]:
-        n, program = self.n_out, self._reverse
-        program = Program(program.inputs, program.outputs[: n + (1 + self.parameters) * slopes])
-        found = program(*values, *self._numbers(numbers, step.code, step), *cotangents)
-        found = [step.code.operand(x, values[0].type) for x in found]
-        return found[:n], found[n + 1 :]
 
 
 class _InMemory(_Explicit):
@@ -214,7 +192,7 @@ class _InMemory(_Explicit):
         data = [room.data(i) for i in range(len(self.data))]
         for i, row in enumerate(self.A):
             for k, x in enumerate([*column[1 : 1 + self.parameters], *self.letters_at(column, sum(row))]):
-                code.store(x, letters, k)
+                code.store(code.operand(x, DOUBLE), letters, k)
             self._move(room, Y, column[0], row, K)
             code.outlined("field", [Y, K[i], g, letters, *data], self.field.fill, rare=False)
         self._move(room, room.state, column[0], self.B, K)

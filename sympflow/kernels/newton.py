@@ -412,7 +412,8 @@ class _InRegisters(NewtonCode):
 
         results = traced(pulled, *(f"x_{i}" for i in range(len(given))))(*given)
         results = [code.operand(x, type) for x in results]
-        return [*results[:n], *[code.constant(0.0, type)] * (self.n_values - n)], results[n:]
+        zero = code.constant(0.0, type)
+        return [*results[:n], *[zero] * (self.n_values - n)], [zero, *results[n:]]
 
     def _iteration(
         self, y: Sequence[Any], K: Sequence[Any], column: list[Any], sizes: Sequence[Any] = ()
@@ -514,7 +515,7 @@ class _InMemory(NewtonCode):
             room[0].store(x, k)
         found, *_ = self._solved(room[0], numbers, step)
         results = found.pulled(cotangents[:n], slopes)
-        return [*results[:n], *[zero] * (self.n_values - n)], results[n:]
+        return [*results[:n], *[zero] * (self.n_values - n)], [zero, *results[n:]]
 
 
 def _solve(M: Value, sizes: Value, N: int, wide: int) -> None:

@@ -108,6 +108,13 @@ class OneStep(Rollouts):
         self.given = self.own = self.parameters
         super().__init__(n_values, 2 * symbols.ndof)
 
+    def check_reverse(self) -> None:
+        if not self.reversible:
+            super().check_reverse()
+
+    def of_values(self, given: Sequence[Value], cotangents: Sequence[Value], kind: Value) -> Sequence[Value]:
+        return cotangents[1 : 1 + self.own]
+
     def own_entries(self, table: Columns, values: np.ndarray) -> Columns:
         """The columns of trajectories with their own values of the parameters."""
         entries = np.repeat(table[0][None], len(values), axis=0)
@@ -132,13 +139,16 @@ class OneStep(Rollouts):
 
     def column(self, code: Code, numbers: Numbers, step: Value) -> list[Value]:
         """The numbers of a column, with the time at which the step begins."""
-        column = [numbers(i) for i in range(self.size)]
+        return self.begun([numbers(i) for i in range(self.size)], code.convert("sitofp", step, "double"))
+
+    def begun(self, column: Sequence[Any], step: Any) -> list[Any]:
+        """The same, of the numbers of a column and after how many steps."""
+        column, at = list(column), 1 + self.parameters
         if self.driven:
-            at, width = 1 + self.parameters, column[0].type.width
-            column[at] = column[at] + code.splat(code.convert("sitofp", step, "double"), width) * column[0]
+            column[at] = column[at] + step * column[0]
         return column
 
-    def letters_at(self, column: Sequence[Value], node: Any) -> list[Value]:
+    def letters_at(self, column: Sequence[Any], node: Any) -> list[Any]:
         """The letters at a time in the step, a node or the value of one."""
         if not self.driven:
             return []
@@ -183,8 +193,7 @@ class OneStepKernel(Kernel):
         return np.repeat(numbers, 3, axis=0), np.zeros(3, dtype=np.int64)
 
     def check_reverse(self) -> None:
-        if not self._code.reversible:
-            super().check_reverse()
+        self._code.check_reverse()
 
     def recorded(self, task: Task) -> Recorded:
         """`runs`, as a run of which cotangents can be pulled back: after `check_reverse`."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import cache, cached_property, partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,13 +22,16 @@ from sympflow.compiler.machine import address
 from sympflow.compiler.program import Program, gradient, tangent, traced
 from sympflow.hamiltonian.formulas import evaluator
 from sympflow.hamiltonian.parts import LINEAR, ExactParts, PartFunctions, SubFlow, shears
-from sympflow.kernels.protocol import Batch, Kernel, Run, Steps, Task, run_states
+from sympflow.kernels.protocol import Batch, Kernel, Run, Steps, Task, begun_in, run_states
 from sympflow.kernels.rollouts import Columns, Rollouts
 from sympflow.kernels.runs import Numbers, begun, finished
 from sympflow.kernels.stage_times import SymbolicLetters
 from sympflow.kernels.terms import MOST_IN_REGISTERS, written_out
 from sympflow.kernels.threads import given
 from sympflow.lazy import kept
+
+if TYPE_CHECKING:
+    from sympflow.kernels.reverse import Between
 
 __all__ = ["Maps", "PartsKernel", "PartsLoops", "parts_loops"]
 
@@ -126,27 +129,25 @@ class PartMaps:
             entries[:, here, : rows.shape[-1]] = rows
         return entries
 
-    def apply(self, code: int, values: list[Value], numbers: Numbers, step: Value) -> list[Value]:
+    def apply(self, code: int, values: Sequence[Any], numbers: Numbers, step: Any) -> Sequence[Any]:
         """The values after a map."""
         if code == IDLE:
             return values
-        new = self._linear(values, numbers) if code == LINEAR else self._moved(code, values, numbers, step)
-        return [values[0].code.operand(x, values[0].type) for x in new]
+        return self._linear(values, numbers) if code == LINEAR else self._moved(code, values, numbers, step)
 
-    def _moved(self, k: int, values: list[Value], numbers: Numbers, step: Value) -> list[Any]:
+    def _moved(self, k: int, values: Sequence[Any], numbers: Numbers, step: Any) -> list[Any]:
         body, letters = self.arranged(k), []
         lettered = self.lettered[k % WITH_GRADIENT - 1]
         if lettered.letters:
-            code, at, width = values[0].code, self.size - TIME_WIDTH, values[0].type.width
-            whole = code.splat(code.convert("sitofp", step, "double"), width)
-            letters = lettered.at(numbers(at + 1) + (whole * numbers(at + 2) + numbers(at)), [])
+            before, first, length = (numbers(self.size - TIME_WIDTH + i) for i in range(TIME_WIDTH))
+            letters = lettered.at(first + (step * length + before), [])
         return body.body(*values, *letters, *(numbers(i) for i in range(len(body.table.outputs))))
 
-    def _linear(self, values: list[Value], numbers: Numbers) -> list[Value]:
+    def _linear(self, values: Sequence[Any], numbers: Numbers) -> list[Any]:
         """Rotations by three shears after exact quarter turns, hyperbolic ones by shears alone, drifts."""
         linear, d = self.parts.linear, self.ndof
         assert linear is not None
-        x, y = values[:d], values[d:]
+        x, y = [*values[:d]], [*values[d:]]
         for j, (kind, f) in enumerate(zip(linear.kinds, linear.classes.tolist(), strict=True)):
             if kind == "idle":
                 continue
@@ -173,7 +174,7 @@ class PartsCode(Rollouts):
     def __init__(self, maps: PartMaps, groups: Sequence[tuple[int, ...]]) -> None:
         super().__init__(2 * maps.ndof, 2 * maps.ndof)
         self.maps, self.groups = self._given = maps, tuple(groups)
-        self.size = maps.size * max(map(len, groups))
+        self.size, self.kinds = maps.size * max(map(len, groups)), len(groups)
 
     def columns(self, groups: Sequence[Sequence[int]], entries: np.ndarray) -> Columns:
         """The columns (n, k, size) of groups of maps, whose numbers are (n, m, size), and their kinds (k,)."""
@@ -186,18 +187,27 @@ class PartsCode(Rollouts):
 
     def stage(self, values: list[Value], numbers: Numbers, kind: Value, step: Value) -> list[Value]:
         """The maps that a column has."""
-        code = values[0].code
+        code, type = values[0].code, values[0].type
+        whole = code.convert("sitofp", step, "double")
+
+        def executed(k: int) -> list[Value]:
+            return [code.operand(x, type) for x in self._executed(k, values, numbers, whole)]
 
         def one_of(kinds: Sequence[int]) -> list[Value]:
             k, *rest = kinds
             if not rest:
-                return self._executed(k, values, numbers, step)
-            this = code.apply("eq", (kind, k))
-            return code.when(this, lambda: self._executed(k, values, numbers, step), lambda: one_of(rest))
+                return executed(k)
+            return code.when(code.apply("eq", (kind, k)), lambda: executed(k), lambda: one_of(rest))
 
-        return one_of(range(len(self.groups)))
+        return one_of(range(self.kinds))
 
-    def _executed(self, k: int, values: list[Value], numbers: Numbers, step: Value) -> list[Value]:
+    def plain(self, kind: int, state: Sequence[Any], column: Sequence[Any], step: Any) -> Sequence[Any]:
+        return self._executed(kind, state, column.__getitem__, step)
+
+    def check_reverse(self) -> None:
+        """All stages have a reverse."""
+
+    def _executed(self, k: int, values: Sequence[Any], numbers: Numbers, step: Any) -> Sequence[Any]:
         for i, code in enumerate(self.groups[k]):
             values = self.maps.apply(code, values, lambda j, i=i: numbers(i * self.maps.size + j), step)
         return values
@@ -436,6 +446,24 @@ class PartsKernel(Kernel):
         work = len(sequence) * loops.parts.ndof
         Y, n_finite, _ = run_states(partial(code.run, columns), task._replace(y0=start), start.shape[1], work)
         return Run(loops.states(Y, task.save, task.y0[:, None]), n_finite)
+
+    def check_reverse(self) -> None:
+        """All maps have a reverse."""
+
+    def recorded(self, task: Task) -> Between:
+        from sympflow.kernels.reverse import Between, Recorded
+
+        loops, sequence = self.loops, self.maps(np.asarray(task.h, dtype=float))
+        (code, columns), parts = loops.run_table(sequence, task.h, task.t0), loops.parts
+        work, save = len(sequence) * parts.ndof, task.save[begun_in(task.save) :]
+        run = Recorded(code, columns, loops.modes(task.y0), task.n_steps, save, work)
+
+        def by(of_q: np.ndarray, of_p: np.ndarray, x: np.ndarray) -> np.ndarray:
+            halves = x[..., : parts.ndof], x[..., parts.ndof :]
+            return np.concatenate([row_products(A, each) for A, each in zip((of_q, of_p), halves, strict=True)], -1)
+
+        out, into = partial(by, parts.C.T, parts.inverse_C), partial(by, parts.inverse_C.T, parts.C)
+        return Between(task, run, loops.states(run.states), out, into)
 
     def step(self, h: ArrayLike, y: np.ndarray, t: ArrayLike = 0.0) -> Steps:
         """One step from each row of `y` (N, 2d), each of its own length `h` (N,)."""

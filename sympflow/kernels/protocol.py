@@ -159,6 +159,20 @@ class Steps(NamedTuple):
     iterations: int = 0
 
 
+def begun_in(save: np.ndarray) -> int:
+    """How many outputs are those after no step."""
+    return int(np.searchsorted(save, 0, "right"))
+
+
+def end_finite(states: np.ndarray, save: np.ndarray, n_finite: np.ndarray) -> None:
+    """Let trajectories (N, n, 2d), after the steps `save`, end before the first state that is not finite."""
+    good = np.isfinite(states).all(-1)
+    for i in np.flatnonzero(~good.all(-1)):
+        row = int(np.argmin(good[i]))
+        if save[row] <= n_finite[i]:
+            states[i, row:], n_finite[i] = np.nan, save[row] - 1
+
+
 def both_ways(step: Callable[[Any, bool], np.ndarray], h: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Rows of `y` (N, 2d) after steps of lengths h (N,): ``step(rows, back)`` is of those that go one way."""
     out = None
@@ -217,6 +231,10 @@ class Kernel(ABC):
     def check_reverse(self) -> None:
         """Raise a ValueError, with the reason, where runs cannot be differentiated: see `SplittingKernel.recorded`."""
         raise NotCompiled("`y0` requires gradients, and the loops of the method have no reverse: use backend='array'.")
+
+    def recorded(self, task: Task) -> Any:
+        """`runs`, as a run of which cotangents can be pulled back, after `check_reverse`: see `reverse.Recorded`."""
+        raise NotImplementedError
 
     @property
     def steps_tensors(self) -> bool:

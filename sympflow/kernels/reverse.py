@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from sympflow.kernels.protocol import Batch
+from sympflow.kernels.protocol import Batch, Task, begun_in, end_finite
 from sympflow.kernels.rollouts import aligned, zeros
 from sympflow.kernels.threads import BLOCK, NEVER, given, run_one, run_rows
 
-__all__ = ["Recorded"]
+__all__ = ["Between", "Recorded"]
 
 MOST_KEPT = 2**23  # numbers of the states that are kept from a run, 64 MB
 SEGMENT = 2**18  # numbers of the states of a segment, which is run again: 2 MB
@@ -155,3 +155,25 @@ class Recorded:
             sizes = len(rows), first, to, later, count, outputs
             code.call(name, width, entries, kinds, len(kinds) - 2, kept, rows, *sizes, found, numbers, starts, values)
         return rows[:n], values[:n] if self._n_own else code.summed(kinds)
+
+
+Pull = Callable[[np.ndarray], np.ndarray]
+
+
+class Between:
+    """A run between a map of its initial states and one of its outputs, whose cotangents are pulled back through both.
+
+    `states` (N, m, 2d) are what the second map makes of the last m outputs of a task, which are the run's, and `out`
+    pulls their cotangents back to these; `into` pulls those of the run's initial states (N, 2d) back.
+    """
+
+    def __init__(self, task: Task, run: Recorded, states: np.ndarray, out: Pull, into: Pull) -> None:
+        self._run, self._out, self._into, self._begun = run, out, into, begun_in(task.save)
+        self.states = np.concatenate([np.repeat(task.y0[:, None], self._begun, axis=1), states], axis=1)
+        self.n_finite = run.n_finite.copy()
+        end_finite(self.states, task.save, self.n_finite)
+
+    def pulled(self, cotangents: np.ndarray, slopes: bool) -> tuple[np.ndarray, np.ndarray]:
+        """As `Recorded.pulled`."""
+        of_states, of_values = self._run.pulled(self._out(cotangents[:, self._begun :]), slopes)
+        return self._into(of_states) + cotangents[:, : self._begun].sum(1), of_values

@@ -5,7 +5,8 @@ from __future__ import annotations
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from functools import cached_property
+from contextlib import nullcontext
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,8 @@ import numpy as np
 from sympflow.compiler import NotCompiled
 from sympflow.compiler.control import Value
 from sympflow.compiler.machine import address, given
-from sympflow.kernels.protocol import Batch
+from sympflow.compiler.program import Program, adjoint, traced
+from sympflow.kernels.protocol import Batch, begun_in, end_finite
 from sympflow.kernels.runs import BLOCK, Memory, Numbers, Room, Values, map_function, reverse_function, run_function
 from sympflow.kernels.threads import NEVER
 
@@ -84,6 +86,8 @@ class Rollouts(ABC):
         Steps after which `look` changes the running state, if given; steps between two looks for the end of a run.
     counted, closing : bool
         True if the last of `n_values` is a count, which is not part of the running state; False if none closes outputs.
+    kinds : int
+        Kinds of stages.
     given, own : int
         Numbers of which a column is made, and how many of them, the last ones, each trajectory may have of its own.
     """
@@ -100,6 +104,7 @@ class Rollouts(ABC):
     block = BLOCK
     counted = False
     closing = True
+    kinds = 1
     given = own = 0
 
     _given: tuple[Any, ...]
@@ -120,8 +125,35 @@ class Rollouts(ABC):
     def adjoint(
         self, values: Values, cotangents: Values, numbers: Numbers, kind: Value, step: Value, slopes: bool, *room: Room
     ) -> tuple[Values, Values]:
-        """The reverse of `stage`, where there is one: see `sympflow.kernels.runs.Adjoint`."""
+        """The reverse of `stage`: see `sympflow.kernels.runs.Adjoint`."""
+        code, type, n = step.code, values[0].type, self.n_values
+        column = [numbers(i, lone=True) for i in range(self.size)]
+        given = [*values, *column, code.convert("sitofp", step, "double"), *cotangents]
+        found = [code.variable(code.constant(0.0, type)) for _ in range(n + self.size * slopes)]
+        for k, program in enumerate(self._reversed):
+            asked = Program(program.inputs, program.outputs[: len(found)])
+            with code.given(code.apply("eq", (kind, k))) if self.kinds > 1 else nullcontext():
+                for result, x in zip(found, asked(*given), strict=True):
+                    result.value = code.operand(x, type)
+        return [x.value for x in found[:n]], [x.value for x in found[n:]]
+
+    def plain(self, kind: int, state: Sequence[Any], column: Sequence[Any], step: Any) -> Sequence[Any]:
+        """The state after a stage of a kind, of recorded numbers: `stage`, up to rounding, to be differentiated."""
         raise NotImplementedError
+
+    @cached_property
+    def _reversed(self) -> list[Program]:
+        """The reverse of the stage of each kind, of the state, a column, the step and the cotangents."""
+        n, names = self.n_values, [f"x_{i}" for i in range(self.n_values + self.size + 1)]
+
+        def stage(kind: int, *x: Any) -> Sequence[Any]:
+            return self.plain(kind, x[:n], x[n:-1], x[-1])
+
+        return [adjoint(traced(partial(stage, k), *names)) for k in range(self.kinds)]
+
+    def check_reverse(self) -> None:
+        """Raise a ValueError, with the reason, where stages have no compiled reverse."""
+        raise NotCompiled("`system` has compiled loops without a reverse, which gradients need: use backend='array'.")
 
     def of_values(self, given: Sequence[Value], cotangents: Sequence[Value], kind: Value) -> Sequence[Value]:
         """The cotangents of values that each trajectory has: see `sympflow.kernels.runs.OfValues`."""
@@ -252,12 +284,8 @@ class Rollouts(ABC):
             self.mapped(before, y0, start)
         self.run(table, batch._replace(y0=start), False)
         self.mapped(after, out.reshape(-1, self.n_out), out.reshape(-1, self.n_out), save)
-        out[:, : np.searchsorted(save, 0, side="right")] = y0[:, None]
-        good = np.isfinite(out).all(-1)
-        for i in np.flatnonzero(~good.all(-1)):
-            row = int(np.argmin(good[i]))
-            if save[row] <= n_finite[i]:
-                out[i, row:], n_finite[i] = np.nan, save[row] - 1
+        out[:, : begun_in(save)] = y0[:, None]
+        end_finite(out, save, n_finite)
 
     def mapped(self, table: Any, y: np.ndarray, out: np.ndarray, steps: np.ndarray = START) -> None:
         """All columns of a table, applied to rows `y` (N, 2d) after steps (n,), in turn; `out` may be `y`."""
@@ -291,7 +319,3 @@ class SplittingRollouts(Rollouts):
     def columns(self, table: np.ndarray) -> Columns:
         """The columns of a table of numbers."""
         return self.prepared(table)
-
-    def check_reverse(self) -> None:
-        """Raise a ValueError, with the reason, where stages have no compiled reverse: see `SplittingCode.adjoint`."""
-        raise NotCompiled("`system` has compiled loops without a reverse, which gradients need: use backend='array'.")

@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 import numpy as np
 
 from sympflow.compiler.arrange import Arrangement
-from sympflow.compiler.control import Type, Value, Variable
+from sympflow.compiler.control import Type, Value
 from sympflow.compiler.functions import FUNCTIONS, added, dot, is_zero, times
 from sympflow.compiler.program import Program, Traced, adjoint, derivatives, gradient, traced
 from sympflow.hamiltonian.formulas import evaluator
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.kernels.rollouts import Columns, SplittingRollouts
-from sympflow.kernels.runs import Numbers, Room, Values, step_function
+from sympflow.kernels.runs import Numbers, Room, step_function
 from sympflow.kernels.stages import kicks_of
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT
 
@@ -334,6 +334,11 @@ class WithinRange:
 
         return code.when(code.any(~inside), exact, lambda: near, rare=True)
 
+    def plain(self, *numbers: Any) -> list[Any]:
+        """The exact state after the stage."""
+        here, n = len(self.near.table.outputs), len(numbers) - len(self.table.outputs)
+        return self._exact.plain(*numbers[:n], *numbers[n + here :])
+
 
 def _of_kick(symbols: Any, terms: int) -> list[Any]:
     """V′, V″M⁻¹V′ and (½ V′M⁻¹V″M⁻¹V′)′ of one position, as many as there are terms."""
@@ -429,11 +434,12 @@ class SplittingCode(SplittingRollouts):
         if not self.timed:
             return [numbers(i) for i in range(len(table.outputs))]
         code, given = step.code, [numbers(i, lone=True) for i in range(self.size)]
-        return [code.operand(x, type) for x in table(*self._lettered(self._time(given, step), given))]
+        time = self._time(given, code.convert("sitofp", step, "double"))
+        return [code.operand(x, type) for x in table(*self._lettered(time, given))]
 
-    def _time(self, given: Sequence[Value], step: Value) -> Value:
+    def _time(self, given: Sequence[Any], step: Any) -> Any:
         before, first, length = given[self._clock]
-        return first + (step.code.convert("sitofp", step, "double") * length + before)
+        return first + (step * length + before)
 
     @cached_property
     def _clock(self) -> slice:
@@ -449,40 +455,18 @@ class SplittingCode(SplittingRollouts):
 
     # the reverse --------------------------------------------------------------------------------------------------
 
-    @cached_property
-    def _adjoints(self) -> list[Program]:
-        """The reverse of the stage of each kind, of the state, a column, the time if it counts, and the cotangents."""
-        if not self.timed:
-            return [adjoint(kind.plain) for kind in self._kinds]
-        names = [f"x_{i}" for i in range(self.n_values)], [f"number_{i}" for i in range(self.size)]
+    @property
+    def kinds(self) -> int:  # type: ignore[override]
+        return len(self._kinds)
 
-        def stage(body: Any, numbers: Sequence[Any]) -> list[Any]:
-            state, given, time = numbers[: self.n_values], numbers[self.n_values : -1], numbers[-1]
-            return body.plain(*state, *body.table(*self._lettered(time, given)))
-
-        return [adjoint(traced(lambda *x, of=kind: stage(of, x), *names[0], *names[1], "time")) for kind in self._kinds]
+    def plain(self, kind: int, state: Sequence[Any], column: Sequence[Any], step: Any) -> Sequence[Any]:
+        body, table = self._kinds[kind].plain, self._kinds[kind].table
+        if self.timed:
+            return body(*state, *table(*self._lettered(self._time(column, step), column)))
+        return body(*state, *column[: len(table.outputs)])
 
     def check_reverse(self) -> None:
-        if not all(isinstance(kind, Stage) for kind in self._kinds) or self._splitting.symbols.samples:
-            super().check_reverse()
-        self._adjoints  # noqa: B018
-
-    def adjoint(
-        self, values: Values, cotangents: Values, numbers: Numbers, kind: Value, step: Value, slopes: bool, *room: Room
-    ) -> tuple[Values, Values]:
-        code, type = step.code, values[0].type
-        zero = code.constant(0.0, type)
-        found: list[Variable] = [code.variable(zero) for _ in range(self.n_values + self.size)]
-        for k, program in enumerate(self._adjoints):
-            n = len(program.inputs) - 2 * self.n_values - self.timed
-            column = [numbers(i, lone=True) for i in range(n)]
-            if self.timed:
-                column.append(self._time(column, step))
-            with code.given(code.apply("eq", (kind, k))) if len(self._adjoints) > 1 else nullcontext():
-                results = [code.operand(x, type) for x in program(*values, *column, *cotangents)]
-                for result, x in zip(found, results, strict=False):
-                    result.value = x
-        return [x.value for x in found[: self.n_values]], [x.value for x in found[self.n_values :]]
+        """All stages have a reverse."""
 
     def of_values(self, given: Sequence[Value], cotangents: Sequence[Value], kind: Value) -> list[Value]:
         if self.timed:
@@ -542,6 +526,19 @@ class SplittingCode(SplittingRollouts):
         return step_function(self.n_values, self.n_out, powers, own_numbers, column, stage, width, self.place)
 
     # tables -------------------------------------------------------------------------------------------------------
+
+    def unclosed(self, table: np.ndarray, more: int = 0) -> np.ndarray:
+        """A table of a run whose outputs are not closed; with two `more` columns, which are idle, that of a map."""
+        table, n = np.concatenate([table, *[table[:, -1:]] * more], axis=1), len(self._splitting.kick_numbers)
+        table[: 1 + n, table.shape[1] - max(more, 1) :] = 0.0
+        return table
+
+    def shifted(self, table: np.ndarray, steps: np.ndarray) -> Columns:
+        """The columns (n, m, size) of a driven system after whole steps (n,), and their kinds."""
+        columns, kinds = self.columns(table)
+        columns, at = np.repeat(columns[None], len(steps), axis=0), self._clock.start
+        columns[..., at + 1] += steps[:, None] * columns[..., at + 2]
+        return columns, kinds
 
     def prepared(self, table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The numbers (m, size) that the code reads, of a table (n, m) of given ones, and the kinds (m,) of columns."""

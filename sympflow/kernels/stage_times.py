@@ -16,20 +16,14 @@ import numpy as np
 import sympy as sp
 
 from sympflow.compiler import NotCompiled
-from sympflow.compiler.control import DOUBLE, INT, Code, Value
 from sympflow.compiler.functions import apply, where
+from sympflow.compiler.tables import Table
 from sympflow.hamiltonian.driving import DURATION, Samples, drift, with_symbols
 from sympflow.hamiltonian.formulas import evaluator, recorded
 from sympflow.hamiltonian.recorded import check_recorded
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 
 __all__ = ["Driving", "SymbolicLetters", "driven_form", "letters_of_time"]
-
-
-MOST_SAMPLED = 200_000
-"""Numbers of samples that compiled code holds."""
-UNIFORM = 1e-9
-"""Relative deviation of equal intervals."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +45,7 @@ class Driving:
         """Same for systems that share their code: names of samples have their digests."""
         return self.time, *self.letters.items(), *self.means.items()
 
-    def values_at(self, time: Value, length: Value, fixed: Sequence[Value]) -> list[Any]:
+    def values_at(self, time: Any, length: Any, fixed: Sequence[Any]) -> list[Any]:
         """The letters at a time, and their means over a length from there, in compiled code."""
         parameters = dict(zip(self.form.parameters, fixed, strict=False))
         values = _values(self._expressions, {self.time: time, DURATION: length, **parameters}, self.samples)
@@ -66,7 +60,7 @@ class Driving:
 
     def check(self) -> None:
         """Refuse what has no compiled form, by a ValueError."""
-        _check((self.form.V, self.form.T, *self._expressions), self.samples)
+        _check((self.form.V, self.form.T, *self._expressions))
 
 
 def driven_form(symbols: SymbolicHamiltonian) -> Driving:
@@ -104,7 +98,7 @@ class SymbolicLetters:
     """Expressions in q, p and `given`: the parameters, and letters for what depends on these and the time alone."""
 
     def __init__(self, symbols: SymbolicHamiltonian, expressions: Sequence[sp.Expr]) -> None:
-        _check(expressions, symbols.samples)
+        _check(expressions)
         found: dict[sp.Expr, sp.Symbol] = {}
         time, fixed = symbols.time, {*symbols.parameters}
         self.expressions = list(expressions)
@@ -113,22 +107,16 @@ class SymbolicLetters:
         self.symbols, self.letters = symbols, {s: f for f, s in found.items()}
         self.given = (*symbols.parameters, *self.letters)
 
-    def at(self, t: Value, parameters: Sequence[Value]) -> list[Value]:
+    def at(self, t: Any, parameters: Sequence[Any]) -> list[Any]:
         """The letters at times t."""
         known = {self.symbols.time: t, **dict(zip(self.symbols.parameters, parameters, strict=True))}
-        return [t.code.operand(x, t.type) for x in _values(self.letters.values(), known, self.symbols.samples)]
+        return _values(self.letters.values(), known, self.symbols.samples)
 
 
-def _check(expressions: Iterable[sp.Expr], samples: Mapping[str, Samples]) -> None:
+def _check(expressions: Iterable[sp.Expr]) -> None:
     """Refuse what has no compiled form."""
     for f in with_symbols(list(expressions))[0]:
         check_recorded(f)
-    for each in samples.values():
-        if each.c.size > MOST_SAMPLED:
-            raise NotCompiled(
-                f"`params` has samples of {len(each.x)} times, more than compiled code holds: give fewer than "
-                f"{MOST_SAMPLED // len(each.c)}, or use backend='array'."
-            )
 
 
 def _values(expressions: Iterable[sp.Expr], known: dict[Any, Any], samples: Mapping[str, Samples]) -> list[Any]:
@@ -159,49 +147,20 @@ def letters_of_time(
 # functions of the time that are given by samples ----------------------------------------------------------------------
 
 
-def sampled_value(samples: Samples, order: int, t: Value) -> Value:
-    """A derivative of samples, of order −1 the antiderivative, at times t, each lane at its own."""
-    name = f"sampled_{samples.digest}_{order}".replace("-", "m")
-
-    def one(t: Value) -> Value:
-        return t.code.outlined(name, [t], lambda t: _polynomial(samples, order, name, t), DOUBLE, rare=False)
-
-    return t.code.lanes(one, [t], t.type)
-
-
-def _polynomial(samples: Samples, order: int, name: str, t: Value) -> Value:
-    """The polynomial of the interval of t, found at once where all are equal, else by bisection."""
-    code, c, x = t.code, samples.polynomials(order), samples.x
-    n, first, last = len(x) - 1, float(x[0]), float(x[-1])
-    times, coefficients = code.array(f"{name}_times", x), code.array(f"{name}_c", c.T.ravel())
-    turns = None
+def sampled_value(samples: Samples, order: int, t: Any) -> Any:
+    """A derivative of samples, of order −1 the antiderivative, at times t: the polynomial of the interval of each."""
+    c, x = samples.polynomials(order), samples.x
+    first, last = float(x[0]), float(x[-1])
+    turns: Any = 0.0
     if samples.periodic:
         turns = apply("floor", (t - first) / (last - first))
         t = t - turns * (last - first)
-    width = (last - first) / n
-    if np.all(np.abs(np.diff(x) - width) <= UNIFORM * width):
-        place = apply("floor", (t - first) * (1 / width))
-        place = where(place > 0.0, where(place < n - 1.0, place, n - 1.0), 0.0)  # NaN too is in the first
-        i = code.convert("fptosi", place, "i64")
-    else:
-        i = _bisected(code, times, n, t)
-    s, k = t - code.load(times, i), len(c)
-    total = code.load(coefficients, i * k)
+    times, coefficients, k = Table(x), Table(c.T), len(c)
+    i = apply("interval", times, t)
+    s = t - apply("entry", times, i, 0.0)
+    total = apply("entry", coefficients, i * float(k), 0.0)
     for j in range(1, k):
-        total = total * s + code.load(coefficients, i * k + j)
-    if turns is not None and order < 0:
+        total = total * s + apply("entry", coefficients, i * float(k), float(j))
+    if order < 0:
         total = total + turns * float(np.polyval(c[:, -1], last - float(x[-2])))
     return total
-
-
-def _bisected(code: Code, times: Value, n: int, t: Value) -> Value:
-    """The last of the first n times that is at most t, the first one if none is."""
-
-    def halved(_: Value, values: list[Value]) -> list[Value]:
-        low, high = values
-        middle = (low + high) >> 1
-        below = code.load(times, middle) <= t
-        return [code.select(below, middle, low), code.select(below, high, middle)]
-
-    low, high = code.constant(0, INT), code.constant(n, INT)
-    return code.loop(max(n - 1, 1).bit_length(), [low, high], halved)[0]
