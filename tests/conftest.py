@@ -133,3 +133,15 @@ def tampered(
     text, kept = json.dumps(notes), json.dumps(record(path), separators=(",", ":"))
     save_file(tensors, path, {KEY: text, SUM: text_checksum(kept if altered else text)})
     return path
+
+
+def refusals(*rows, ids=None):
+    """A test that each call raises its error: rows of (call, error, pattern of the message), or (call, pattern)."""
+    named = [(call, *(error or [ValueError]), message) for call, *error, message in rows]
+
+    @pytest.mark.parametrize(("call", "error", "message"), named, ids=ids)
+    def test(call, error, message):
+        with pytest.raises(error, match=message):
+            call()
+
+    return test

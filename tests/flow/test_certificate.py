@@ -9,14 +9,13 @@ import torch
 from conftest import tampered
 
 import sympflow
-from sympflow import Box, HamiltonianSystem, MLPFlow, SympFlow, solve, systems
+from sympflow import Box, HamiltonianSystem, SympFlow, solve, systems
 from sympflow.flow.certificate import Certificate, Quantiles, upper_limit
 from sympflow.flow.files import load
 from sympflow.flow.shipped import named, shipped
 
 HH, PENDULUM, OSCILLATOR = systems.henon_heiles(), systems.pendulum(), systems.harmonic_oscillator()
 QUICK = {"states": 300, "times": 9, "held_out": 20, "t_end": 100.0}
-EPS = np.finfo(float).eps
 NETWORK = named("henon_heiles-sympflow").path
 
 
@@ -58,65 +57,8 @@ def test_the_bound_holds_along_orbits(name):
     assert (error[1:][inside[:-1]] <= np.broadcast_to(bound[1:], error[1:].shape)[inside[:-1]]).all()
     assert found.energy_error.largest <= found.bound(100.0)
     assert found.bound(100.0) < 1e4 * found.energy_error.largest  # pessimistic, but it says something
-
-
-@pytest.mark.slow
-def test_the_bound_counts_steps():
-    found = primed().certificate(HH, **QUICK)
-    delta = found.delta.largest
-    assert [found.bound(t) / delta for t in (0.0, 0.1, 0.5, 0.6, 100.0, -1.0)] == pytest.approx([0, 1, 1, 2, 200, 2])
-
-
-@pytest.mark.slow
-def test_delta_is_the_integral_of_the_rate():
-    """Against H itself: the mean over x of d/dt H(ψ̄_t(x)), integrated, is what H gained."""
-    flow = primed()
-    found = flow.certificate(HH, **{**QUICK, "states": 1, "times": 401})
-    # one state alone: the integral of |rate| is at least what H gained, and the variation of H along the step
-    t = torch.linspace(0, flow.dt, 401, dtype=torch.float64)
-    x = HH.domain.sample(1, int(np.random.SeedSequence([0, 20_261, 0]).generate_state(1)[0]))
-    H = HH.hamiltonian(flow.psi(t, torch.tensor(x))).numpy()
-    assert found.delta.median == pytest.approx(np.abs(np.diff(H)).sum(), rel=2e-3)
-    assert found.delta.median == found.delta.q95 <= found.delta.largest  # which is searched for near the state
-
-
-@pytest.mark.slow
-def test_delta_is_not_exceeded_by_states_that_are_drawn_later():
-    """A state at which a step of the Kepler flow gains twice the largest of 2000 samples; and 20,000 others."""
-    kepler = systems.kepler()
-    flow = sympflow.load(next(f.path for f in sympflow.shipped_flows(kepler) if f.name == "kepler-primed-2-0.15"))
-    found = flow.certificate(kepler, held_out=2, t_end=1.0)
-    worst = np.array([[-0.36674323, -0.05063473, -0.0382541, -2.10487249]])
-    x = np.concatenate([worst, kepler.domain.sample(20_000, 4711)])
-    H = kepler.hamiltonian
-    gain = np.abs(H(flow.bind(kepler).psi(flow.dt, torch.as_tensor(x)).detach().numpy()) - H(x))
-    assert gain.max() <= found.delta.largest < 3 * gain.max()
-
-
-@pytest.mark.slow
-def test_numba_functions_are_certified_like_their_symbols():
-    """The third derivatives in a force gradient are differences there, good to ε^(2/3) of the defect's terms."""
-    numba = pytest.importorskip("numba")
-
-    @numba.njit
-    def potential(q):
-        return 1 - np.cos(q[0])
-
-    @numba.njit
-    def gradient(q, out):
-        out[0] = np.sin(q[0])
-
-    @numba.njit
-    def hessian_vector(q, v, out):
-        out[0] = np.cos(q[0]) * v[0]
-
-    functions = {"potential": potential, "gradient": gradient, "hessian_vector": hessian_vector}
-    system = HamiltonianSystem(**functions, mass=1.0, ndof=1, domain=PENDULUM.domain)
-    options = {"states": 50, "times": 5, "held_out": 5, "t_end": 2.0}
-    found, expected = (primed(s).certificate(s, **options) for s in (system, PENDULUM))
-    for name in ("defect", "hamiltonian_error", "delta", "one_step_error", "energy_error"):
-        ours, theirs = getattr(found, name), getattr(expected, name)
-        assert (ours.median, ours.largest) == pytest.approx((theirs.median, theirs.largest), rel=1e-6), name
+    steps = [found.bound(flow.dt * t) / found.delta.largest for t in (0.0, 0.2, 1.0, 1.2, 200.0, -2.0)]
+    assert steps == pytest.approx([0, 1, 1, 2, 200, 2])
 
 
 def test_an_upper_limit_of_a_quantile():
@@ -130,16 +72,6 @@ def test_an_upper_limit_of_a_quantile():
     assert upper_limit(np.array([1.0, math.nan])) == math.inf
 
 
-def test_older_certificates_have_no_limit(certified):
-    found = certified[0].certified
-    assert found.relative_limit == found.relative_energy_error.largest  # of 20 states
-    older = found.to_dict()
-    del older["relative_limit"]
-    assert Certificate.from_dict(older).relative_limit is None
-    with pytest.raises(ValueError, match="relative_limit that is not a number"):
-        Certificate.from_dict({**older, "relative_limit": "small"})
-
-
 def test_the_error_of_the_hamiltonian_against_its_definition():
     flow = shipped(HH)
     found = flow.certificate(HH, **{**QUICK, "times": 2, "states": 100, "t_end": 10.0})
@@ -148,14 +80,6 @@ def test_the_error_of_the_hamiltonian_against_its_definition():
     values = torch.cat([(d - d.mean()).abs() for d in differences])
     assert found.hamiltonian_error.largest == pytest.approx(float(values.max()), rel=1e-12)
     assert found.hamiltonian_error.q95 == pytest.approx(float(values.quantile(0.95, interpolation="higher")), rel=1e-6)
-
-
-def test_an_exact_flow_is_found_exact(rotation):
-    found = rotation.certificate(OSCILLATOR, **QUICK)
-    for q in (found.defect, found.hamiltonian_error, found.delta):
-        assert q.largest < 8 * EPS
-    assert found.energy_error.largest < 100 * 8 * EPS
-    assert found.bound(100.0) < 100 * 8 * EPS
 
 
 def test_the_measured_errors_are_those_of_solve(certified):
@@ -172,27 +96,12 @@ def test_the_measured_errors_are_those_of_solve(certified):
     assert found.relative_energy_error.largest == pytest.approx(relative.max(), rel=1e-9)
 
 
-def test_long_runs_go_piece_by_piece(certified, monkeypatch):
-    whole = certified[0].certified
-    monkeypatch.setattr("sympflow.flow.certification.SAVED_VALUES", 20 * 4 * 7)
-    pieces = primed().certificate(HH, **QUICK)
-    assert pieces.left == whole.left
-    # the rounding of a chaotic orbit differs where a piece begins
-    assert pieces.energy_error.largest == pytest.approx(whole.energy_error.largest, rel=1e-6)
-
-
 def test_orbits_that_blow_up_are_infinite_errors():
     big = HamiltonianSystem.from_sympy(str(HH.symbols.H), domain=Box([-3.0] * 4, [3.0] * 4))
     found = primed(big).certificate(big, **{**QUICK, "t_end": 40.0})
     assert found.left > 0
     assert Quantiles.of(np.array([1.0, math.nan, -2.0])).largest == math.inf
     assert Quantiles.of(np.array([-3.0, 1.0, 2.0])) == Quantiles(2.0, 3.0, 3.0)
-
-
-def test_the_same_seed_gives_the_same_certificate(certified):
-    same, other = (primed().certificate(HH, **QUICK, seed=s) for s in (0, 1))
-    assert certified[0].certified == same
-    assert same.delta != other.delta
 
 
 def test_single_precision(certified):
@@ -223,16 +132,6 @@ def test_a_certificate_is_of_the_weights_it_was_made_of(tmp_path):
         HH, flow=flow, optimizer="adam", steps=1, points=40, validation_points=40, progress=False, matching_weight=0.0
     )
     assert trained.certified is None
-
-
-def test_a_flow_in_another_precision_is_saved_without_its_certificate(tmp_path):
-    flow = primed()
-    flow.certificate(HH, **QUICK)
-    with pytest.warns(RuntimeWarning, match="another precision"):
-        flow.to(torch.float32).save(tmp_path / "single.safetensors")
-    single = sympflow.load(tmp_path / "single.safetensors", system=HH)
-    assert single.dtype == torch.float32
-    assert single.certified is None
 
 
 @pytest.mark.parametrize(
@@ -269,11 +168,6 @@ def test_solve_says_that_the_certificate_does_not_hold_outside():
 # bad arguments -----------------------------------------------------------------------------------------------------
 
 
-def test_a_network_without_a_hamiltonian_has_no_certificate():
-    with pytest.raises(TypeError, match=r"^`flow` is an unconstrained network.*use a SympFlow"):
-        MLPFlow(2).certificate(HH)
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -288,11 +182,3 @@ def test_a_network_without_a_hamiltonian_has_no_certificate():
 def test_bad_arguments_are_refused(arguments, message):
     with pytest.raises(ValueError, match=message):
         primed().certificate(HH, **arguments)
-
-
-def test_the_wrong_system_and_no_domain_are_refused():
-    with pytest.raises(ValueError, match=r"^`system`"):
-        primed().certificate(PENDULUM)
-    free = HamiltonianSystem.from_sympy("p**2/2 + q**4")
-    with pytest.raises(ValueError, match=r"^`flow` has no domain"):
-        SympFlow(1).certificate(free)

@@ -12,8 +12,7 @@ from test_primed import FLOWS as PRIMED
 
 from sympflow import Box, HamiltonianSystem, MLPFlow, SympFlow, Tube, load, solve, systems, time_transformed
 from sympflow.flow.clocked import ClockedFlow
-from sympflow.flow.families import FAMILIES, family, family_of
-from sympflow.flow.flow_map import FlowMap
+from sympflow.flow.families import FAMILIES
 from sympflow.flow.layers import Drift, Kick
 from sympflow.flow.planetary import KeplerFlow
 from sympflow.flow.potentials import MLPPotential
@@ -64,19 +63,6 @@ def test_every_family_is_here():
 
 
 @EACH
-def test_a_flow_is_built_again_from_its_architecture(name):
-    make, system = FLOWS[name]
-    flow = make()
-    plan = flow.architecture()
-    assert type(flow) is family("sympflow" if name == "timed" else name) is family_of(flow.kind, plan)
-    again = type(flow).from_architecture(plan["ndof"], plan, flow.dt, flow.dtype)
-    assert again.architecture() == plan
-    again.load_state_dict(flow.state_dict())
-    x = torch.as_tensor(system.y0)
-    assert torch.equal(again.bound(system).psi(0.1, x, **started(flow)), flow.psi(0.1, x, **started(flow)))
-
-
-@EACH
 def test_what_is_asked_of_a_flow_map(name):
     make, system = FLOWS[name]
     flow, x = make(), torch.as_tensor(system.y0)
@@ -86,7 +72,7 @@ def test_what_is_asked_of_a_flow_map(name):
     other = HamiltonianSystem(lambda q: (q**4).sum(-1), ndof=flow.ndof)
     assert flow.matches(other) == (flow.fingerprint is None)
     if name not in ("sympflow", "mlp"):
-        with pytest.raises(ValueError, match=r"^`system` '.*' (is not the one|has no drive)"):
+        with pytest.raises(ValueError, match=r"^`system` 'V of a function' (is not the one|has no drive)"):
             solve(other, flow, (0, 1), np.zeros(2 * flow.ndof))
     assert flow.origin is None
     assert len(flow.clock_numbers()) == (3 if name == "clocked" else 0)
@@ -297,48 +283,3 @@ def test_runs_files_and_copies_are_the_flow(lawful, tmp_path):
         )
         direct = torch.stack([flow(float(s - t0), x, **begun) for s in run.t], -1)
         np.testing.assert_allclose(run.y, direct, rtol=0, atol=1e3 * EPS * float(1 + direct.abs().max()))
-
-
-@pytest.mark.parametrize("backend", ["compiled", "array"])
-def test_one_planet_is_back_after_its_period(backend):
-    """Whatever the trained numbers are: its motion is Kepler's, and nothing kicks it."""
-    masses = [1.0, 0.01]
-    system = HamiltonianSystem.planets(masses, elements={"a": [1.3], "e": [0.3], "inc": [0.2]}, encounter=None)
-    period = 2 * np.pi * np.sqrt(1.3**3 / sum(masses))
-    flow = KeplerFlow(system.ndof, 2, 1, period / 16, system=system)
-    flow.kicks.copy_(torch.linspace(0.1, 0.4, 4))
-    sol = solve(system, flow, (0, period), t_eval=[0.3, period], backend=backend)
-    np.testing.assert_allclose(sol.y[:, -1], system.y0, rtol=0, atol=16 * 64 * EPS)
-
-
-def test_a_flow_in_another_time_knows_the_system_that_it_is_for():
-    flow = FLOWS["clocked"][0]()
-    origin = {"system": KEPLER.name, "fingerprint": list(KEPLER.fingerprint), "shift": TRANSFORMED.params["shift"]}
-    flow.recipe = {"transforms": origin}
-    assert flow.origin.is_of(KEPLER)
-    assert not flow.matches(KEPLER)
-    with pytest.raises(ValueError, match="but in another time"):
-        flow.check_system(KEPLER)
-
-
-def test_a_family_of_ones_own_needs_only_the_map():
-    class Identity(FlowMap):
-        kind = "sympflow"
-
-        def _map(self, t, y):
-            return y
-
-        _map_inverse = _map
-
-    flow = Identity(1, 0.5)
-    x = torch.ones(3, 2, dtype=torch.float64)
-    assert torch.equal(flow(-1.2, x), x)
-    assert solve(PENDULUM, flow, (0, 2), y0=[0.1, 0.2]).y[:, -1] == pytest.approx([0.1, 0.2], abs=0)
-
-
-def test_units_are_values():
-    scaling = Scaling([1.0, 2.0], (0.5, 1), t=2.0)
-    assert (scaling.q, scaling.p, scaling.q_center) == ((1.0, 2.0), (0.5, 1.0), (0.0, 0.0))
-    assert Scaling.from_dict(scaling.to_dict()) == scaling == pickle.loads(pickle.dumps(scaling))
-    with pytest.raises(AttributeError):
-        scaling.t = 1.0

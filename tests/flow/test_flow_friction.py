@@ -5,7 +5,7 @@ import pytest
 import torch
 
 import sympflow
-from sympflow import HamiltonianSystem, SympFlow, solve
+from sympflow import SympFlow, solve
 from sympflow.systems import damped_pendulum, pendulum
 
 DT = 0.8
@@ -54,29 +54,3 @@ def test_a_file_knows_the_friction(system, flow, tmp_path):
     for other in (damped_pendulum(0.31), pendulum()):
         with pytest.raises(ValueError, match="is not the one that this flow was trained for"):
             sympflow.load(tmp_path / "flow.safetensors", system=other)
-
-
-def test_flows_without_the_friction_are_refused(system, flow, conservative):
-    for use in (
-        lambda: solve(system, conservative),
-        lambda: conservative.check_system(system),
-        lambda: sympflow.train(system, flow=conservative),
-    ):
-        with pytest.raises(
-            ValueError, match=r"^`system` 'damped_pendulum' has friction, .*flow\.transferred\(system\)"
-        ):
-            use()
-    with pytest.raises(ValueError, match="no sympflow flow that ships was trained with it"):
-        solve(system, "sympflow", tol=1e-6)
-    for use in (
-        lambda: flow.hamiltonian(0.1, torch.zeros(2, dtype=torch.float64)),
-        lambda: flow.certificate(system),
-        lambda: sympflow.train(system, flow=flow, loss="labels+matching"),
-        lambda: sympflow.train(system, kind="sympflow"),
-        lambda: solve(system, SympFlow(1)),
-        lambda: SympFlow.primed(HamiltonianSystem.from_sympy("sqrt(1 + p**2) - cos(q)", damping=0.1)),
-    ):
-        with pytest.raises(ValueError, match="has friction"):
-            use()
-    with pytest.raises(ValueError, match=r"^`compensated`"):
-        solve(system, "sympflow", flow=flow, compensated=True)

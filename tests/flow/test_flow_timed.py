@@ -1,21 +1,16 @@
 """Networks of driven systems: SympFlows whose potentials take the time of the state, and their training."""
 
-from dataclasses import replace
 from math import pi
 
 import numpy as np
 import pytest
 import torch
-from scipy.integrate import solve_ivp
 
 import sympflow
 from sympflow import Box, HamiltonianSystem, SympFlow, solve
 from sympflow.flow.sympflow import Drive
-from sympflow.interop import torchdiffeq as ours
-from sympflow.interop.scipy import as_scipy
 
 DT, W = 0.4, 2.7
-X = torch.tensor([[0.5, 0.1], [-0.3, 0.8], [0.9, -0.6]], dtype=torch.float64)
 
 
 def driven(H="p**2/2 - cos(q)*(1 + a*cos(w*t))", a=0.3, **more):
@@ -29,24 +24,12 @@ def system():
 
 
 @pytest.fixture(scope="module")
-def bare(system):
-    return SympFlow.timed(system, 2, hidden=(8,), dt=DT, seed=1).requires_grad_(False)
-
-
-@pytest.fixture(scope="module")
 def trained(system):
     return sympflow.train(
         system, kind="sympflow", pairs=2, hidden=(8,), dt=DT, optimizer="gauss-newton", steps=40, points=150,
         matching_weight=0.1, label_weight=0.1, label_times=2, validation_points=100, reference_states=30,
         progress=False,
     )  # fmt: skip
-
-
-@pytest.fixture(scope="module")
-def hardly(system):
-    """Trained for a few steps that compile nothing: it is a flow of this drive, and not a good one."""
-    few = {"points": 20, "validation_points": 20, "reference_states": 5, "label_weight": 0.0, "progress": False}
-    return sympflow.train(system, kind="sympflow", pairs=2, hidden=(8,), dt=DT, optimizer="adam", steps=3, **few)
 
 
 def test_training_fits_it_at_all_times_of_the_drive(system, trained):
@@ -65,27 +48,6 @@ def test_training_fits_it_at_all_times_of_the_drive(system, trained):
     assert sympflow.symplecticity_defect(sol).max() < 1e-13
 
 
-def test_scipy_and_torchdiffeq_tell_it_the_time(system, hardly):
-    times = np.array([2.9, 1.75, 1.35])
-    expected = solve(system, hardly, (2.9, 1.35), t_eval=times).y
-    scipy = solve_ivp(system, (2.9, 1.35), system.y0, method=as_scipy(hardly, system), t_eval=times)
-    np.testing.assert_allclose(scipy.y, expected, rtol=0, atol=1e-13)
-    y = ours.odeint(system, torch.tensor(system.y0), torch.tensor(times), method=hardly)
-    np.testing.assert_allclose(y.T, expected, rtol=0, atol=1e-13)
-
-
-def test_a_file_holds_it_with_its_drive(system, hardly, tmp_path):
-    hardly.save(tmp_path / "flow.safetensors")
-    again = sympflow.load(tmp_path / "flow.safetensors", system=system)
-    torch.testing.assert_close(again(1.7, X, t0=0.3), hardly(1.7, X, t0=0.3), rtol=0, atol=0)
-    assert (again.drive, again.period) == (hardly.drive, system.period)
-    with pytest.raises(ValueError, match="was trained with another drive"):
-        solve(driven(a=0.2), again, (0, 1))
-    other = again.transferred(driven(a=0.2))
-    torch.testing.assert_close(other(1.7, X, t0=0.3), hardly(1.7, X, t0=0.3), rtol=0, atol=0)
-    solve(driven(a=0.2), other, (0, 1))
-
-
 def test_networks_take_any_hamiltonian_and_drives_without_a_period():
     system = driven("p**2*(1 + q**2/4)/2 + q**2/2 + a*q*tanh(w*t)", period=None, t_span=(0, 4))
     flow = sympflow.train(
@@ -97,25 +59,3 @@ def test_networks_take_any_hamiltonian_and_drives_without_a_period():
     solve(system, flow, (0, 4))
     with pytest.warns(UserWarning, match="a drive without a period"):
         solve(system, flow, (0, 5))
-
-
-def test_it_is_refused_where_it_does_not_belong(system, bare):
-    still = HamiltonianSystem.from_sympy("p**2/2 - cos(q)", y0=[0.5, 0.1], domain=system.domain)
-    with pytest.raises(ValueError, match=r"`system` .* is not driven"):
-        SympFlow.timed(still)
-    with pytest.raises(ValueError, match=r"no drive.*SympFlow\.timed"):
-        solve(still, bare, (0, 1))
-    with pytest.raises(ValueError, match=r"the period 1\.0"):
-        solve(driven(params={"a": 0.3, "w": 2 * pi}, period=1.0), bare, (0, 1))
-    with pytest.raises(ValueError, match=r"networks of SympFlow\.timed"):
-        solve(system, SympFlow(1), (0, 1))
-    with pytest.raises(ValueError, match="is driven"):
-        sympflow.train(system, kind="mlp", steps=1, progress=False)
-    with pytest.raises(TypeError, match="`t0` is missing"):
-        bare(0.1, X)
-    with pytest.raises(ValueError, match="`harmonics`"):
-        SympFlow.timed(system, harmonics=0)
-    with pytest.raises(ValueError, match="`times`"):
-        replace(bare.drive, period=None)
-    with pytest.raises(TypeError, match=r"SympFlow\.timed"):
-        sympflow.train(system, harmonics=3)

@@ -15,7 +15,7 @@ from torch import nn
 from sympflow import SympFlow, load, solve, systems, train
 from sympflow.flow import potentials
 from sympflow.flow.layers import Drift, Kick
-from sympflow.flow.potentials import MLPPotential, Potential, activation_named, register_activation, register_potential
+from sympflow.flow.potentials import MLPPotential, Potential, activation_named, register_activation
 from sympflow.flow.scaling import Scaling
 
 PENDULUM = systems.pendulum()
@@ -98,36 +98,6 @@ def test_exported_weights_load_into_plain_modules_and_give_the_same_map():
     torch.testing.assert_close(flow(t, x), theirs(t, x), rtol=1e-13, atol=1e-13)
 
 
-@pytest.mark.parametrize("hidden", [(4,), (4, 3), (3, 5, 2)])
-def test_a_round_trip_keeps_every_bit_where_units_are_one(hidden):
-    flow = SympFlow(1, pairs=2, hidden=hidden, activation="sin", dt=1.0, scale=Scaling.unit(1))
-    again = SympFlow.from_potentials(flow.to_potentials(), dt=flow.dt)
-    x = states(5, 1)
-    assert torch.equal(again(0.6, x), flow(0.6, x))
-    assert torch.equal(again.hamiltonian(0.6, x), flow.hamiltonian(0.6, x))
-    lists = [
-        {k: [a.tolist() for a in v] if isinstance(v, list) else v for k, v in e.items()} for e in again.to_potentials()
-    ]
-    assert torch.equal(SympFlow.from_potentials(lists, dt=1.0)(0.6, x), flow(0.6, x))
-
-
-def test_time_may_be_the_first_input_and_layers_come_in_any_order():
-    flow = SympFlow(2, pairs=1, hidden=(4,), scale=Scaling.unit(2))
-    entries = flow.to_potentials()[::-1]
-    first = [{**e, "time": "first", "weights": [np.roll(e["weights"][0], 1, 1), *e["weights"][1:]]} for e in entries]
-    x = states(3, 2)
-    reverse = SympFlow.from_layers([*flow.layers][::-1], dt=1.0)
-    assert torch.equal(SympFlow.from_potentials(first, dt=1.0)(0.5, x), reverse(0.5, x))
-
-
-def test_the_dtype_is_that_of_the_numbers():
-    net = nn.Sequential(nn.Linear(2, 3), nn.Tanh(), nn.Linear(3, 1, bias=False))
-    assert SympFlow.from_potentials([("kick", net)], dt=1.0).dtype == torch.float32
-    double = SympFlow.from_potentials([("kick", net)], dt=1.0, dtype=torch.float64)
-    assert double.dtype == torch.float64
-    assert torch.equal(double.layers[0].potential.weight_x.float(), net[0].weight[:, :1])
-
-
 def test_an_imported_flow_solves_trains_and_is_saved(tmp_path):
     flow = SympFlow.from_potentials(PlainSympFlow(1, 1, 3, nn.Tanh()).entries(), dt=0.5)
     sol = solve(PENDULUM, flow, (0, 2), on_domain_exit="ignore")
@@ -166,15 +136,6 @@ GOOD = SympFlow(1, pairs=1, hidden=(3, 2)).to_potentials()[0]
 def test_what_does_not_fit_is_refused_with_its_number(entry, error, message):
     with pytest.raises(error, match=rf"^`potentials\[1\]` cannot be taken: .*{message}"):
         SympFlow.from_potentials([GOOD, entry], dt=1.0)
-
-
-def test_lists_that_are_none_are_refused():
-    other = SympFlow(2, pairs=1, hidden=(3,)).to_potentials()[0]
-    for given, error in (([], ValueError), ([GOOD, other], ValueError), (GOOD, TypeError), (None, TypeError)):
-        with pytest.raises(error, match=r"^`potentials` must be "):
-            SympFlow.from_potentials(given, dt=1.0)
-    with pytest.raises(TypeError, match=r"^`flow` has layers other than kicks and drifts with MLP potentials"):
-        SympFlow.from_layers([Kick(Square(1))], dt=1.0).to_potentials()
 
 
 # activations of a user's own -----------------------------------------------------------------------------------------
@@ -228,27 +189,6 @@ def test_without_numba_the_extra_is_named(monkeypatch):
     assert solve(PENDULUM, flow, (0, 2), on_domain_exit="ignore").stats["backend"] == "torch"
 
 
-def test_without_a_compiled_form_it_runs_by_arrays_and_says_why():
-    register_activation("softsign_like", softsign_like)
-    flow = SympFlow(1, pairs=1, hidden=(3,), activation="softsign_like", dt=1.0)
-    assert solve(PENDULUM, flow, (0, 2), on_domain_exit="ignore").stats["backend"] == "torch"
-    with pytest.raises(ValueError, match=r"or one that was registered with `compiled`, to be compiled"):
-        solve(PENDULUM, flow, (0, 2), backend="compiled")
-
-
-def test_networks_with_it_are_imported_by_its_values():
-    register_activation("softsign_like", softsign_like)
-
-    class Theirs(nn.Module):
-        def forward(self, a):
-            return a * torch.rsqrt(1 + a**2)
-
-    theirs = PlainSympFlow(1, 1, 3, Theirs())
-    flow = SympFlow.from_potentials(theirs.entries(), dt=1.0)
-    x, t = states(4, 1), torch.tensor(0.7, dtype=torch.float64)
-    torch.testing.assert_close(flow(t, x), theirs(t, x), rtol=1e-13, atol=1e-13)
-
-
 @pytest.mark.parametrize(
     ("arguments", "error", "message"),
     [
@@ -265,19 +205,6 @@ def test_networks_with_it_are_imported_by_its_values():
 def test_activations_that_cannot_be_right_are_refused(arguments, error, message):
     with pytest.raises(error, match=message):
         register_activation(*arguments)
-
-
-def test_closed_forms_of_a_user_are_checked():
-    class Wrong(potentials.Activation):
-        def slope(self, a):
-            return potentials.ACTIVATIONS["tanh"].slope(a)
-
-        def tangent(self, a, da):
-            h, slope, dh, dslope = potentials.ACTIVATIONS["tanh"].tangent(a, da)
-            return h, slope, dh, -dslope
-
-    with pytest.raises(ValueError, match=r"^`activation` 'wrong' has a tangent\(\) whose dslope is not that of value"):
-        register_activation("wrong", Wrong())
 
 
 # files of flows that need what is registered -----------------------------------------------------------------------
@@ -303,68 +230,6 @@ class Square(Potential):
     @classmethod
     def from_dict(cls, ndof, plan, dtype):
         return cls(ndof).to(dtype)
-
-
-class Crooked(Square):
-    @classmethod
-    def from_dict(cls, ndof, plan, dtype):
-        raise KeyError("width")
-
-
-def test_a_file_says_which_activation_it_needs_and_how_it_gets_it(tmp_path, monkeypatch):
-    path = tmp_path / "flow.safetensors"
-    register_activation("softsign_like", softsign_like)
-    flow = SympFlow(1, pairs=1, hidden=(3,), activation="softsign_like")
-    flow.save(path)
-    assert torch.equal(load(path)(0.5, states(2, 1)), flow(0.5, states(2, 1)))
-    monkeypatch.setattr(potentials.activations, "added", {})
-    with pytest.raises(ValueError) as refused:
-        load(path)
-    assert str(refused.value).endswith(
-        "is not a usable flow: it needs the activation 'softsign_like', which is not known here. Import the package "
-        "that it is from, or register it by sympflow.flow.potentials.register_activation, before you load the file."
-    )
-
-
-def test_a_file_says_which_potential_it_needs_and_how_it_gets_it(tmp_path, monkeypatch):
-    path = tmp_path / "flow.safetensors"
-    flow = SympFlow.from_layers([Kick(Square(1)), Drift(MLPPotential(1, (3,)))], dt=0.5)
-    with pytest.raises(ValueError, match=r"^`flow` has a potential Square that no file can name: register the class"):
-        flow.save(path)
-    assert not path.exists()
-    register_potential("square", Square)
-    flow.save(path)
-    x = states(2, 1)
-    assert torch.equal(load(path)(0.4, x), flow(0.4, x))
-    register_potential("square", Crooked)
-    with pytest.raises(ValueError, match=r"its potential 'square' cannot be built \(KeyError: 'width'\)"):
-        load(path)
-    monkeypatch.setattr(potentials.potentials, "added", {})
-    with pytest.raises(ValueError, match=r"it needs the potential 'square', .* sympflow.flow.potentials.register_pot"):
-        load(path)
-
-
-def test_layers_of_a_users_own_are_not_saved_into_a_file_that_cannot_be_read(tmp_path):
-    class Shear(Kick):
-        pass
-
-    flow = SympFlow.from_layers([Shear(MLPPotential(1, (3,)))], dt=0.5)
-    with pytest.raises(ValueError, match=r"^`flow` has a layer Shear, and files hold kicks and drifts only"):
-        flow.save(tmp_path / "flow.safetensors")
-
-
-@pytest.mark.parametrize(
-    ("name", "potential", "error"),
-    [("mlp", Square, ValueError), ("", Square, ValueError), (3, Square, TypeError), ("other", int, TypeError)],
-)
-def test_bad_registrations_of_potentials_are_refused(name, potential, error):
-    with pytest.raises(error, match=r"^`(name|potential)` "):
-        register_potential(name, potential)
-
-
-def test_a_potential_without_from_dict_is_not_registered():
-    with pytest.raises(TypeError, match=r"^`potential` Potential has no from_dict\(\), which reads files"):
-        register_potential("other", Potential)
 
 
 @pytest.fixture
@@ -393,14 +258,3 @@ def test_a_file_finds_what_installed_plugins_announce(announced, tmp_path):
         activation_named("seven")
     with pytest.raises(ImportError, match=r"^`potential` 'pi' of the plug-in .* is not valid"):
         potentials.potential_named("pi")
-
-
-# train, with data and without H ------------------------------------------------------------------------------------
-
-DATA = (np.zeros(3), np.zeros((3, 2)), np.zeros((3, 2)))
-
-
-@pytest.mark.parametrize("call", [lambda: train(data=DATA), lambda: train(DATA), lambda: train(None), train])
-def test_training_on_data_alone_says_that_h_is_needed(call):
-    with pytest.raises(TypeError, match=r"^`system` must be a HamiltonianSystem, the H .* it finds no H in data\."):
-        call()

@@ -8,7 +8,7 @@ import struct
 import pytest
 from watchdog import watched
 
-from sympflow import Ball, SympFlow, Tube, load, solve, systems
+from sympflow import SympFlow, Tube, load
 from sympflow.flow.records import text_checksum
 
 
@@ -156,37 +156,3 @@ def test_places_that_hold_no_file(tmp_path):
     for path in (3, None, b"flow", ["flow"]):
         with pytest.raises(TypeError, match=r"^`path` must be the path of a file"):
             load(path)
-
-
-def test_a_description_too_long_to_be_read_is_not_saved(tmp_path):
-    flow = SympFlow(1)
-    flow.domain = Tube([[0.1 * k, 1 / 3] for k in range(60_000)], 1.0)
-    with pytest.raises(ValueError, match=r"^`flow` cannot be saved as it is: its description takes .* fewer"):
-        flow.save(tmp_path / "flow.safetensors")
-    assert not list(tmp_path.iterdir())
-
-
-def test_the_command_line_says_what_is_wrong_with_a_file(tmp_path):
-    from typer.testing import CliRunner
-
-    from sympflow.commands import app
-
-    path = tmp_path / "hostile.safetensors"
-    path.write_bytes(struct.pack("<Q", 10**18))
-    result = CliRunner().invoke(app, ["solve", "pendulum", "--method", str(path)])
-    assert result.exit_code != 0
-    assert "oversized" in " ".join(result.output.split())
-
-
-def test_a_domain_in_a_file_is_that_of_the_flow(tmp_path):
-    flow = SympFlow(2)
-    orbit = solve(systems.henon_heiles(), "verlet", (0, 5)).states
-    for domain in (
-        Tube(orbit, 0.05),
-        Tube(orbit, [0.05] * 4, [[0, 2], [1, 3]]),
-        systems.kepler().domain,
-        Ball([0] * 4, 1),
-    ):
-        flow.domain = domain
-        flow.save(tmp_path / "flow.safetensors")
-        assert load(tmp_path / "flow.safetensors").domain == domain

@@ -1,16 +1,12 @@
 """A flow knows its system by H all over its domain and along the run, not near the origin alone."""
 
-import copy
-import gc
-import pickle
-import weakref
+import re
 
 import numpy as np
 import pytest
 import torch
 
-import sympflow
-from sympflow import Ball, Box, HamiltonianSystem, SympFlow, load, shipped_flows, solve, systems
+from sympflow import HamiltonianSystem, load, shipped_flows, solve, systems
 from sympflow.flow.shipped import named
 from sympflow.hamiltonian.fingerprint import Identity, same_system
 
@@ -26,6 +22,7 @@ def walled(where, **scene):
 @pytest.mark.parametrize("where", [0.6, 2.0, 2.4])
 def test_a_system_that_differs_far_from_the_origin_is_another(where):
     other = walled(where)
+    named_so = re.escape(other.name)
     assert same_system(other.fingerprint, PENDULUM.fingerprint)
     assert len(shipped_flows(other)) == 0
     for method, flow in [
@@ -34,9 +31,9 @@ def test_a_system_that_differs_far_from_the_origin_is_another(where):
         ("sympflow", "pendulum-primed-3-1"),
         ("mlp", "pendulum-mlp"),
     ]:
-        with pytest.raises(ValueError, match=r"^`system` '.*' (has no shipped|is not the one that this flow)"):
+        with pytest.raises(ValueError, match=rf"^`system` '{named_so}' (has no shipped|is not the one that this flow)"):
             solve(other, method, (0, 1), **({} if flow is None else {"flow": flow}))
-    with pytest.raises(ValueError, match=r"^`system` '.*' is not the one"):
+    with pytest.raises(ValueError, match=f"^`system` '{named_so}' is not the one"):
         load(named("pendulum-primed-3-1").path, system=other)
 
 
@@ -79,13 +76,6 @@ def test_the_same_system_in_other_words_is_the_same(system):
     solve(system, "mlp", (0, 2), [2.8, 0.0])
 
 
-def test_flows_that_ship_are_not_shared_by_systems_that_differ_outside_of_the_domain():
-    """Each runs on its own forces."""
-    for system in (walled(2.6), PENDULUM):
-        flow = sympflow.get("sympflow")().flow_for(system)
-        assert flow.system.force(np.array([2.8]))[0] == pytest.approx(system.force(np.array([2.8]))[0])
-
-
 @pytest.mark.parametrize(
     ("name", "system"),
     [
@@ -110,43 +100,6 @@ def test_files_hold_the_identity_and_those_of_before_load(name, system, tmp_path
     before = load(tmp_path / "before.safetensors")
     assert before.identity is None
     assert before.fingerprint == flow.fingerprint
-
-
-def test_in_another_time_the_system_in_the_physical_one_is_known():
-    kepler = systems.kepler(0.5)
-    other = HamiltonianSystem.from_sympy(
-        "(p1**2 + p2**2)/2 - 1/sqrt(q1**2 + q2**2) + Max(q1 - 0.6, 0)**2/50", domain=kepler.domain, y0=kepler.y0
-    )
-    assert same_system(other.fingerprint, kepler.fingerprint)
-    assert solve(kepler, "log_sympflow", (0, 1)).status == 0
-    with pytest.raises(ValueError, match=r"^`flow` is needed: no flow in another time ships"):
-        solve(other, "log_sympflow", (0, 1))
-    with pytest.raises(ValueError, match=r"^`system` '.*' has 2 degrees|is not the one"):
-        solve(other, "sympflow", (0, 1), flow="kepler-log-1")
-
-
-def test_training_keeps_it_over_the_domain_that_was_trained_on():
-    box = Box([1.0, -1.0], [3.0, 1.0])
-    flow = SympFlow.primed(PENDULUM, stages=1, dt=0.1)
-    assert flow.identity.expression == PENDULUM.expression
-    trained = sympflow.train(PENDULUM, flow=flow, domain=box, optimizer="gauss-newton", restarts=1, points=10)
-    states = trained.identity.states
-    assert box.contains(states).mean() > 0.9
-    np.testing.assert_allclose([states.min(0), states.max(0)], [box.low, box.high], atol=0.01)  # its ends among them
-    assert not trained.matches(walled(2.9, domain=box))
-    for again in (copy.deepcopy(trained), pickle.loads(pickle.dumps(trained))):
-        assert again.matches(PENDULUM)
-        assert not again.matches(walled(2.9, domain=box))
-
-
-def test_of_functions_by_values_alone():
-    system = HamiltonianSystem(lambda q: (q**4).sum(-1) / 4, ndof=1, domain=Ball([0.0, 0.0], 2.0))
-    identity = Identity.of(system, system.domain)
-    assert identity.expression is None
-    for offset in (0.0, 1e6):
-        assert identity.agrees(HamiltonianSystem(lambda q, c=offset: c + (q**4).sum(-1) / 4, ndof=1))
-    assert not identity.agrees(HamiltonianSystem(lambda q: (q**4).sum(-1) / 4 + torch.relu(q[..., 0] - 1.8), ndof=1))
-    assert Identity.from_dict(identity.to_dict(), 1).agrees(system)
 
 
 @pytest.mark.parametrize("expression", ["__import__('os').system('x')", "q1 +", "q1**2 + p1**2 + q2", "k*q1"])
@@ -175,28 +128,3 @@ def test_a_text_in_a_file_is_read_by_a_grammar_and_proves_nothing_where_it_is_no
 def test_what_is_no_identity_is_refused(description):
     with pytest.raises(ValueError, match=r"^its? "):
         Identity.from_dict(description, 1)
-
-
-def test_no_system_is_kept_alive():
-    solve(PENDULUM, "sympflow", (0, 1))  # the first keeps the flow that ships, which later ones share
-    system = systems.pendulum()
-    solve(system, "sympflow", (0, 1))
-    solve(PENDULUM, "sympflow", (0, 1))  # the loops of that flow are those of the last system
-    gone = weakref.ref(system)
-    del system
-    gc.collect()
-    assert gone() is None
-
-
-def test_a_file_is_known_again_where_h_overflows_at_common_states(tmp_path):
-    """A Morse well of hydrogen in SI units: exp(−aq) is infinite at q = −0.3 m."""
-
-    def well(depth):
-        numbers = {"D": depth, "a": 1.9e10, "m": 8.4e-28}
-        domain = Box([-1e-11, -5e-24], [1.2e-11, 5e-24])
-        return HamiltonianSystem.from_sympy("p**2/(2*m) + D*(1 - exp(-a*q))**2", params=numbers, domain=domain)
-
-    SympFlow.primed(well(7.5e-19), 1, dt=1e-15).save(tmp_path / "flow.safetensors")
-    sympflow.load(tmp_path / "flow.safetensors", system=well(7.5e-19))
-    with pytest.raises(ValueError, match="is not the one that this flow was trained for"):
-        sympflow.load(tmp_path / "flow.safetensors", system=well(7.6e-19))

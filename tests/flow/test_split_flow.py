@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from sympflow import Box, HamiltonianSystem, SympFlow, get, solve
-from sympflow.systems import double_well, fput, harmonic_oscillator, henon_heiles, spring_pendulum
+from sympflow.systems import double_well, fput
 from sympflow.systems.chains import oscillatory_energies
 from sympflow.training.trainer import train
 
@@ -46,14 +46,6 @@ def test_untrained_it_is_the_impulse_method():
     assert np.abs(flow(0.1, x).detach().numpy() - y).max() < 1e-14
 
 
-@pytest.mark.parametrize("turn", [20.0, 1e3])
-def test_the_oscillator_for_a_million_steps(turn):
-    system = harmonic_oscillator(100.0)
-    flow = SympFlow.split(system, 1, dt=turn / 100)
-    sol = solve(system, flow, (0, 1e6 * flow.dt), save_every=1000, on_domain_exit="ignore")
-    assert np.abs(sol.energy_error()).max() < 1e-11
-
-
 def harmonic_pair():
     """A fast oscillator coupled to a slow particle."""
     return HamiltonianSystem.from_sympy(
@@ -80,21 +72,6 @@ def test_a_fit_lowers_the_error_at_all_times():
 
 
 @pytest.mark.slow
-def test_split_flows_train_as_all_others_do():
-    """By other optimizers too; what they have no use for is refused."""
-    system = harmonic_pair()
-    start = SympFlow.split(system, 1, dt=0.2, terms=3)
-    options = {"points": 20, "label_times": 3, "restarts": 3, "steps": 10, "reference_states": 10}
-    assert train(system, flow=start, **options).figures["one_step_error"] < 0.1
-    adam = train(system, flow=start, optimizer="adam", steps=2, points=20, validation_points=40, reference_states=5)
-    assert any(not torch.equal(a, b) for a, b in zip(start.parameters(), adam.parameters(), strict=True))
-    with pytest.raises(TypeError, match=r"^`learning_rate` is not an option of the optimizer 'gauss-newton' for split"):
-        train(system, flow=start, learning_rate=1.0)
-    with pytest.raises(ValueError, match=r"^`loss` 'residual' is not one"):
-        train(system, flow=start, loss="residual")
-
-
-@pytest.mark.slow
 def test_the_shipped_flow_of_fput_reaches_its_figures():
     system = fput(omega=50.0)
     sol = solve(system, t_eval=np.linspace(0, 200, 1001))
@@ -103,26 +80,3 @@ def test_the_shipped_flow_of_fput_reaches_its_figures():
     assert np.abs(oscillatory_energies(system, sol.y.T).sum(-1) - 1).max() < 0.08
     between = solve(system, t_eval=np.linspace(0, 200, 301)[1:] - 0.05)
     assert np.abs(between.energy_error()).max() < 1e-4
-
-
-@pytest.mark.slow
-def test_the_shipped_flow_of_the_spring_pendulum_beats_its_parts():
-    system = spring_pendulum(1e6, coordinates="polar")
-    flow, parts = solve(system), solve(system, "strang_parts", dt=0.01)
-    assert flow.stats["dt"] == pytest.approx(0.01)
-    assert np.abs(flow.energy_error()).max() < np.abs(parts.energy_error()).max()
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"stages": 0}, r"^`stages` must be a positive integer"),
-        ({"stages": 10**6}, r"^`stages` must be a positive integer, at most 1000"),
-        ({"terms": 0}, r"^`terms` must be a positive integer"),
-        ({"force_gradient": (0,), "stages": 3}, r"^`force_gradient` .* not the same from either end"),
-        ({"force_gradient": (0, 7), "stages": 8, "parts": ("p2**2/2",)}, r"^`parts` do not add up"),
-    ],
-)
-def test_what_makes_no_flow_is_refused(options, message):
-    with pytest.raises(ValueError, match=message):
-        SympFlow.split(henon_heiles(), **options)

@@ -5,15 +5,13 @@ import pickle
 import numpy as np
 import pytest
 import torch
-import torchdiffeq
+from conftest import refusals
 from numba import njit
 from scipy.interpolate import CubicSpline, make_interp_spline
 
 import sympflow
 from sympflow import HamiltonianSystem, solve
 from sympflow.hamiltonian.fingerprint import same_system
-from sympflow.studies.reports import described
-from sympflow.systems.user_files import from_toml
 from sympflow.testing.checks import CHECKS
 
 made = HamiltonianSystem.from_sympy
@@ -97,14 +95,6 @@ def test_derivatives_are_those_of_h_at_each_time():
     assert DRIVEN.hamiltonian(Y.astype(np.float32), 1e4).dtype == np.float32
 
 
-def test_a_force_of_the_time_alone_is_that_of_each_state():
-    pushed = made("(p1**2 + p2**2)/2 + q1*cos(t) + q2**2", time="t")
-    y = np.arange(12.0).reshape(3, 4)
-    for function in ("gradient", "vector_field", "hessian"):
-        found = getattr(pushed, function)(torch.tensor(y), 0.3)
-        np.testing.assert_allclose(found, getattr(pushed, function)(y, 0.3), atol=1e-15)
-
-
 TIMES = np.linspace(0, 10, 81)
 SPLINES = {
     "cubic": CubicSpline(TIMES, np.cos(W * TIMES)),
@@ -139,11 +129,13 @@ def test_a_parameter_may_be_a_function_of_t_by_its_samples(kind):
             solve(system, "rk45", (0, 30))
 
 
-def test_other_samples_are_another_system():
+def test_another_drive_is_another_system():
     splines = SPLINES["cubic"], CubicSpline(TIMES, np.cos(W * TIMES) * (TIMES < 5))
     one, two = (made("p**2/2 - a*cos(q)", params={"a": a}, t_span=(0, 9)) for a in splines)
     assert one.expression != two.expression
     assert not same_system(one.fingerprint, two.fingerprint)
+    for w in (1.71, W * (1 + 1e-6)):
+        assert not same_system(DRIVEN.fingerprint, made(TEXT, time="t", params={"a": 0.3, "w": w}).fingerprint)
 
 
 def test_the_drift_of_t_dependent_kinetic_energy_is_its_integral():
@@ -166,87 +158,53 @@ def test_the_drift_of_t_dependent_kinetic_energy_is_its_integral():
     np.testing.assert_array_equal(DRIVEN.drift(p[:1], 0.3, 0.5), 0.5 * p[:1])
 
 
-def test_another_drive_is_another_system():
-    others = [made(TEXT, time="t", params={"a": 0.3, "w": w}) for w in (1.71, W * (1 + 1e-6))]
-    for other in (*others, sympflow.systems.pendulum()):
-        assert not same_system(DRIVEN.fingerprint, other.fingerprint)
-
-
-def test_order_of_steps_and_their_jacobians():
-    method = sympflow.get("rk4")()
-    ends = [solve(DRIVEN, "rk4", (0.4, 3.6), dt=h, t_eval=[3.6]).y[:, -1] for h in (0.2, 0.1, 0.05)]
-    slope = np.log2(np.abs(ends[0] - ends[1]).max() / np.abs(ends[1] - ends[2]).max())
-    assert 3.6 < slope < 4.6
-    h = np.array([0.1, -0.2])
-    end, A = method.tangent(DRIVEN, T, Y, h)
-    np.testing.assert_allclose(end, method.step(DRIVEN, T, Y, h), rtol=1e-15)
-    e = 1e-6
-    columns = [
-        (method.step(DRIVEN, T, Y + e * v, h) - method.step(DRIVEN, T, Y - e * v, h)) / (2 * e) for v in np.eye(2)
-    ]
-    np.testing.assert_allclose(A, np.stack(columns, -1), atol=1e-9)
-    sol = solve(DRIVEN, "dop853", (0, 5), rtol=1e-11, atol=1e-11)
-    assert sympflow.symplecticity_defect(sol) < 1e-8
-    assert abs(sympflow.volume_error(sol)) < 1e-8
-    assert sympflow.reference_error(sol).max() < 1e-9
-    assert sympflow.time_reversal_error(sol) < 1e-8
-
-
 SOL = solve(DRIVEN, "rk45", (0, 3), t_eval=np.linspace(0, 3, 40))
 SUBLEVEL = sympflow.EnergySublevel(1.0, sympflow.Box([-1, -1], [1, 1]))
 AW, SAMPLED = {"a": 1, "w": W}, {"a": SPLINES["cubic"]}
 HERE = "^`system` 'driven_pendulum' is driven"
 
 
-@pytest.mark.parametrize(
-    ("make", "error", "message"),
-    [
-        (lambda: made("p**2/2 + t*q**2"), TypeError, '^`expression` depends on the time.*time="t"'),
-        (lambda: made("p**2/2 + q**2", time="t"), ValueError, "^`time` is 't', which H does not"),
-        (lambda: made("p**2/2 + q**2", time="q1"), ValueError, "^`time` 'q1' is a coordinate"),
-        (lambda: made("p**2/2 + q**2", time="2t"), ValueError, "^`time` '2t' is no name"),
-        (lambda: made("p**2/2 + a*q**2", params=AW, time="a"), ValueError, "^`time` 'a' is a"),
-        (lambda: made("p**2/2 + t*q**2", time=1), TypeError, "^`time` must be the name"),
-        (lambda: made("p**2/2 + q**2", period=1), TypeError, "^`period` only goes with `time`"),
-        (lambda: made(TEXT, time="t", params=AW, period=3.7), ValueError, "^`period` 3.7 is not a period"),
-        (lambda: made(TEXT, time="t", params=AW, period=-1), ValueError, "^`period` must be"),
-        (lambda: made("p**2/2 + q**2", params=SAMPLED), ValueError, "^`params` has 'a'"),
-        (
-            lambda: made("p**2/2 + a*q", params={"a": CubicSpline([0, 1], [[0, 1], [1, 2]])}),
-            ValueError,
-            "^`params` has a, a spline that is not of real numbers",
-        ),
-        (
-            lambda: HamiltonianSystem(lambda q: q[..., 0], ndof=1, time=True),
-            TypeError,
-            r"^`potential` is called with \(t, q\), the time first",
-        ),
-        (lambda: HamiltonianSystem(potential, ndof=1, time="t"), TypeError, "^`time` must be True"),
-        (lambda: DRIVEN.hamiltonian(Y), TypeError, "^`t` is missing"),
-        (lambda: DRIVEN.force(Y[:, :1]), TypeError, "^`t` is missing"),
-        (lambda: DRIVEN.hamiltonian(Y, 1j), TypeError, "^`t` must be a real number"),
-        (lambda: DRIVEN.hamiltonian(Y, np.zeros(3)), ValueError, "^`t` must be a number, or have the shape"),
-        (
-            lambda: made("sqrt(1 + (p - cos(t))**2) + q", time="t").drift(Y[:, :1], 0.0, 0.1),
-            ValueError,
-            "^`system` has a kinetic energy .* not elementary",
-        ),
-        (lambda: sympflow.time_transformed(DRIVEN), ValueError, HERE),
-        (lambda: solve(DRIVEN, "log_kahan_li8"), ValueError, HERE),
-        (lambda: solve(DRIVEN, "linear_srkn6b"), ValueError, "do not depend on t"),
-        (lambda: solve(DRIVEN, "mlp"), ValueError, HERE),
-        (lambda: sympflow.energy_error(SOL), ValueError, "energy_balance_error"),
-        (lambda: sympflow.max_energy_error(SOL), ValueError, "energy_balance_error"),
-        (lambda: sympflow.energy_drift(SOL), ValueError, "energy_balance_error"),
-        (lambda: sympflow.stability(DRIVEN), ValueError, "is driven"),
-        (lambda: sympflow.compare(DRIVEN, ["rk45"], match="energy_error"), ValueError, "is driven.*'balance'"),
-        (lambda: sympflow.compare(DRIVEN, ["rk45"], ["energy"]), ValueError, "is driven"),
-        (lambda: made(TEXT, time="t", params=AW, domain=SUBLEVEL), ValueError, "is driven"),
-    ],
+test_bad_input_is_named = refusals(
+    (lambda: made("p**2/2 + t*q**2"), TypeError, '^`expression` depends on the time.*time="t"'),
+    (lambda: made("p**2/2 + q**2", time="t"), "^`time` is 't', which H does not"),
+    (lambda: made("p**2/2 + q**2", time="q1"), "^`time` 'q1' is a coordinate"),
+    (lambda: made("p**2/2 + q**2", time="2t"), "^`time` '2t' is no name"),
+    (lambda: made("p**2/2 + a*q**2", params=AW, time="a"), "^`time` 'a' is a"),
+    (lambda: made("p**2/2 + t*q**2", time=1), TypeError, "^`time` must be the name"),
+    (lambda: made("p**2/2 + q**2", period=1), TypeError, "^`period` only goes with `time`"),
+    (lambda: made(TEXT, time="t", params=AW, period=3.7), "^`period` 3.7 is not a period"),
+    (lambda: made(TEXT, time="t", params=AW, period=-1), "^`period` must be"),
+    (lambda: made("p**2/2 + q**2", params=SAMPLED), "^`params` has 'a'"),
+    (
+        lambda: made("p**2/2 + a*q", params={"a": CubicSpline([0, 1], [[0, 1], [1, 2]])}),
+        "^`params` has a, a spline that is not of real numbers",
+    ),
+    (
+        lambda: HamiltonianSystem(lambda q: q[..., 0], ndof=1, time=True),
+        TypeError,
+        r"^`potential` is called with \(t, q\), the time first",
+    ),
+    (lambda: HamiltonianSystem(potential, ndof=1, time="t"), TypeError, "^`time` must be True"),
+    (lambda: DRIVEN.hamiltonian(Y), TypeError, "^`t` is missing"),
+    (lambda: DRIVEN.force(Y[:, :1]), TypeError, "^`t` is missing"),
+    (lambda: DRIVEN.hamiltonian(Y, 1j), TypeError, "^`t` must be a real number"),
+    (lambda: DRIVEN.hamiltonian(Y, np.zeros(3)), "^`t` must be a number, or have the shape"),
+    (
+        lambda: made("sqrt(1 + (p - cos(t))**2) + q", time="t").drift(Y[:, :1], 0.0, 0.1),
+        "^`system` has a kinetic energy .* not elementary",
+    ),
+    (lambda: sympflow.time_transformed(DRIVEN), HERE),
+    (lambda: solve(DRIVEN, "log_kahan_li8"), HERE),
+    (lambda: solve(DRIVEN, "linear_srkn6b"), "do not depend on t"),
+    (lambda: solve(DRIVEN, "mlp"), HERE),
+    (lambda: sympflow.energy_error(SOL), "energy_balance_error"),
+    (lambda: sympflow.max_energy_error(SOL), "energy_balance_error"),
+    (lambda: sympflow.energy_drift(SOL), "energy_balance_error"),
+    (lambda: sympflow.stability(DRIVEN), "is driven"),
+    (lambda: sympflow.compare(DRIVEN, ["rk45"], match="energy_error"), "is driven.*'balance'"),
+    (lambda: sympflow.compare(DRIVEN, ["rk45"], ["energy"]), "is driven"),
+    (lambda: made(TEXT, time="t", params=AW, domain=SUBLEVEL), "is driven"),
 )
-def test_bad_input_is_named(make, error, message):
-    with pytest.raises(error, match=message):
-        make()
 
 
 def test_a_gradient_that_is_right_at_its_first_time_alone_is_found():
@@ -255,15 +213,6 @@ def test_a_gradient_that_is_right_at_its_first_time_alone_is_found():
     )
     with pytest.raises(ValueError, match=r"^`gradient` is not that of `potential`: at t = 1\.327, q = "):
         solve(wrong, "rk45", (0, 1))
-
-
-def test_reports_name_a_drive_and_its_samples():
-    report = sympflow.compare(DRIVEN, ["rk45"], ["error"], t_span=(0, 2), repeats=1)
-    assert report.rows[0].status == "ok"
-    assert report.to_dict()["system"]["params"] == {"a": 0.3, "w": W}
-    sampled = made("p**2/2 - a*cos(q)", params=SAMPLED, t_span=(0, 9))
-    assert "81 samples" in sampled.title
-    assert "samples" in described(sampled)["params"]["a"]
 
 
 class FirstOrder(sympflow.integrators.base.FixedStep):
@@ -284,36 +233,30 @@ class Pretender(FirstOrder):
         return y + h * system.vector_field(y, 0.0)
 
 
-class RightOne(Pretender):
-    """Euler's method, with the time of its stage."""
-
-    takes_driving = True
-
-    def step(self, system, t, y, h):
-        h = sympflow.arrays.per_state(h, y)
-        return y + h * system.vector_field(y, t)
-
-
 def test_a_method_that_says_nothing_of_the_time_is_refused_and_one_that_lies_is_caught():
     with pytest.raises(ValueError, match="'forgets_t' does not take the time into account"):
         solve(DRIVEN, FirstOrder)
     check = {check.name: check for check in CHECKS}["the_drive_is_in_the_steps"]
     with pytest.raises(AssertionError, match="do not say `takes_driving`"):
         check(Pretender(dt=0.001))
-    check(RightOne(dt=0.001))
     check(sympflow.get("rk4")())
 
 
-def test_peers_solve_system_of_t_and_y():
-    y0 = torch.tensor([1.0, 0.0], dtype=torch.float64)
-    peer = torchdiffeq.odeint(DRIVEN, y0, torch.tensor([1.0, 4.0]), method="dopri5", rtol=1e-10, atol=1e-10)[-1]
-    ours = solve(DRIVEN, "dop853", (1, 4), t_eval=[4], rtol=1e-10, atol=1e-10).y[:, -1]
-    np.testing.assert_allclose(peer, ours, atol=1e-8)
-
-
-def test_a_file_may_hold_a_drive(tmp_path):
-    path = tmp_path / "driven.toml"
-    path.write_text(f'hamiltonian = "{TEXT}"\ntime = "t"\nperiod = {PERIOD!r}\nparams = {{ a = 0.3, w = 1.7 }}\n')
-    system = from_toml(path)
-    assert system.period == PERIOD
-    assert same_system(system.fingerprint, DRIVEN.fingerprint)
+def test_order_of_steps_and_their_jacobians():
+    method = sympflow.get("rk4")()
+    ends = [solve(DRIVEN, "rk4", (0.4, 3.6), dt=h, t_eval=[3.6]).y[:, -1] for h in (0.2, 0.1, 0.05)]
+    slope = np.log2(np.abs(ends[0] - ends[1]).max() / np.abs(ends[1] - ends[2]).max())
+    assert 3.6 < slope < 4.6
+    h = np.array([0.1, -0.2])
+    end, A = method.tangent(DRIVEN, T, Y, h)
+    np.testing.assert_allclose(end, method.step(DRIVEN, T, Y, h), rtol=1e-15)
+    e = 1e-6
+    columns = [
+        (method.step(DRIVEN, T, Y + e * v, h) - method.step(DRIVEN, T, Y - e * v, h)) / (2 * e) for v in np.eye(2)
+    ]
+    np.testing.assert_allclose(A, np.stack(columns, -1), atol=1e-9)
+    sol = solve(DRIVEN, "dop853", (0, 5), rtol=1e-11, atol=1e-11)
+    assert sympflow.symplecticity_defect(sol) < 1e-8
+    assert abs(sympflow.volume_error(sol)) < 1e-8
+    assert sympflow.reference_error(sol).max() < 1e-9
+    assert sympflow.time_reversal_error(sol) < 1e-8

@@ -5,10 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 
 from sympflow import HamiltonianSystem, solve, splitting_method
-from sympflow.kernels.pairs import PairCode, PairForces
+from sympflow.kernels.pairs import PairForces
 from sympflow.kernels.threads import at_most
 from sympflow.schemes import SCHEMES
 from sympflow.training.table_step import ArrayForces
@@ -71,20 +70,6 @@ class TestFunctions:
         np.testing.assert_allclose(F.T, system.force(q.T), rtol=1e-10, atol=1e-9)
         np.testing.assert_allclose(G.T, -system.hessian_vector(q.T, system.velocity(F.T)), rtol=1e-9, atol=1e-6)
 
-    @pytest.mark.parametrize("system", [gravity(5), fluid(3, 1.5)], ids=["gravity", "Lennard-Jones"])
-    def test_of_tensors_are_derivatives_of_each_other(self, system):
-        q = torch.tensor(system.y0[: system.ndof], requires_grad=True)
-        v = torch.randn(system.ndof, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-        (slope,) = torch.autograd.grad(system.potential(q), q, create_graph=True)
-        (product,) = torch.autograd.grad(slope @ v, q, create_graph=True)
-        (bent,) = torch.autograd.grad(product @ v, q)
-        for mine, theirs in (
-            (-system.force(q), slope),
-            (system.hessian_vector(q, v), product),
-            (system.third_derivative(q, v, v), bent),
-        ):
-            torch.testing.assert_close(mine, theirs, rtol=1e-9, atol=1e-9 * float(theirs.detach().abs().max()))
-
     def test_a_cut_off_is_smooth(self):
         two = HamiltonianSystem.pairs(LENNARD_JONES, masses=[1.0, 1.0], dim=1, cutoff=2.5)
         q = np.array([[0, 2.5 - 1e-6], [0, 2.5 + 1e-6], [0, 3.0]])
@@ -122,17 +107,6 @@ class TestRuns:
             sol = solve(system, "chin4a", t_eval=[1.0], backend=backend)
             np.testing.assert_allclose(sol.y, exact, atol=1e-6)
 
-    @pytest.mark.parametrize("method", ["gauss_legendre4", "log_leapfrog"])
-    def test_methods_that_need_symbols_take_those_of_a_few_bodies(self, method):
-        system = gravity(3)
-        sol = solve(system, method, (0, 0.5))
-        assert sol.stats["backend"] == "compiled"
-        np.testing.assert_allclose(sol.y, solve(system, method, (0, 0.5), backend="array").y, rtol=0, atol=1e-12)
-        assert gravity(7).written is None
-        heavier = system.with_params(G=0.5)
-        q = system.y0[:9]
-        np.testing.assert_allclose(heavier.written.potential(q), heavier.potential(q), rtol=1e-13)
-
     def test_threads_share_a_large_system_and_keep_its_bits(self):
         system = gravity(330)
         runs = []
@@ -147,39 +121,6 @@ class TestRuns:
         assert sol.status == -1
         assert len(sol.t) == 1
 
-    def test_a_thread_that_fails_ends_the_others(self, monkeypatch):
-        system = gravity(330)
-        function = PairCode.function
-
-        def failing(self, name, width):
-            run, fails = function(self, name, width), iter([False, True])
-
-            def member(*given):
-                if next(fails, False):
-                    raise MemoryError("no room")
-                run(*given)
-
-            return member
-
-        monkeypatch.setattr(PairCode, "function", failing)
-        with at_most(3), pytest.raises(MemoryError, match="no room"):
-            solve(system, "verlet", (0, 1), t_eval=[1], backend="compiled")
-
-    def test_friction_of_many_rates_is_not_compiled(self):
-        each = gravity(4, damping=np.linspace(0.1, 0.2, 12))
-        assert solve(each, "verlet").stats["backend"] != "compiled"
-        with pytest.raises(ValueError, match=r"`system` .pairs. has friction, and its loops take one rate"):
-            solve(each, "verlet", backend="compiled")
-
-    def test_values_of_parameters_of_each_trajectory(self):
-        system = gravity(4)
-        together = solve(system, "verlet", params={"G": [0.25, 0.5]})
-        alone = solve(system.with_params(G=0.5), "verlet")
-        np.testing.assert_array_equal(together.y[1], alone.y)
-        np.testing.assert_array_equal(together.y[0], solve(system, "verlet").y)
-        with pytest.raises(ValueError, match=r"^`params` has 'g', and those of the system are G"):
-            system.with_params(g=1.0)
-
     @pytest.mark.parametrize("n", [4, 40], ids=["written out", "in memory"])
     def test_curvature_terms_are_those_of_arrays(self, n):
         chin = SCHEMES["chin4c"]
@@ -187,18 +128,6 @@ class TestRuns:
         method = splitting_method(curved)
         compiled, by_arrays = (solve(gravity(n), method, (0, 0.2), backend=b).y for b in ("compiled", "array"))
         np.testing.assert_allclose(compiled, by_arrays, rtol=0, atol=1e-13)
-
-    @pytest.mark.parametrize("n_side", [4, 6], ids=["all pairs", "cells"])
-    def test_atoms_in_a_box(self, n_side):
-        system = fluid(n_side)
-        sol = solve(system, "verlet", (0, 0.02))
-        np.testing.assert_allclose(sol.y, solve(system, "verlet", (0, 0.02), backend="array").y, rtol=0, atol=1e-11)
-        assert np.ptp(sol.energy()) < 1e-3 * np.abs(sol.energy()).max()
-        moved = system.y0.copy()
-        moved[0] += 1.2 * n_side  # an image of the first atom
-        np.testing.assert_allclose(
-            system.force(moved[: system.ndof]), system.force(system.y0[: system.ndof]), atol=1e-9
-        )
 
     def test_open_space_with_a_cut_off(self):
         """A drop far away makes cells of most of the plane empty."""
@@ -234,13 +163,6 @@ def test_a_run_that_passes_a_place_without_v_ends_there(V, more, y0, dt, where):
     sol = solve(system, "verlet", (0, 3 * dt), np.stack([still, y0]), dt=dt)
     np.testing.assert_array_equal(sol.status, [0, -1])
     assert f"passed {where} of two bodies, where H is infinite" in sol.message
-
-
-@pytest.mark.parametrize(
-    ("V", "options"), [("sin(r)/r", {}), ("log(1 + r**2)", {}), ("r", {}), ("1/r", {"softening": 0.1})]
-)
-def test_where_there_is_none_nothing_is_looked_at(V, options):
-    assert not HamiltonianSystem.pairs(V, masses=np.ones(3), dim=3, **options).definition.poles
 
 
 class TestBadInput:

@@ -104,38 +104,6 @@ def test_a_run_that_leaves_a_grid_with_bounds_ends():
     assert np.abs(sol.y[:2]).max() <= X[-1]
 
 
-def test_gradients_flow_through_compiled_runs():
-    torch = pytest.importorskip("torch")
-    system, y0 = _system("RectBivariateSpline")
-
-    def end(y):
-        return solve(system, "verlet", (0.0, 1.0), y, dt=0.05, t_eval=[1.0])
-
-    y = torch.tensor(y0, requires_grad=True)
-    sol = end(y)
-    assert sol.stats["backend"] == "compiled"
-    (found,) = torch.autograd.grad(sol.y.sum(), y)
-    h = 1e-6
-    differences = [(end(y0 + h * e).y.sum() - end(y0 - h * e).y.sum()) / (2 * h) for e in np.eye(4)]
-    np.testing.assert_allclose(found, differences, rtol=1e-8)
-
-
-def test_programs_with_tables_can_be_pickled():
-    system, _ = _system("CubicSpline")
-    program = pickle.loads(pickle.dumps(system.form.program))
-    q = np.linspace(-2.0, 2.0, 9)
-    np.testing.assert_array_equal(program(q)[0], system.form.program(q)[0])
-    assert str(program) == str(system.form.program)
-
-
-def test_scipy_is_left_as_it_was():
-    before = dict(vars(CubicSpline)), dict(vars(PPoly)), dict(vars(UnivariateSpline))
-    system, _ = _system("CubicSpline")
-    assert system.form is not None
-    assert (dict(vars(CubicSpline)), dict(vars(PPoly)), dict(vars(UnivariateSpline))) == before
-    assert cubic(0.5) == pytest.approx(0.5**4 / 4 - 0.5**2 / 2, abs=1e-4)
-
-
 kinked = PchipInterpolator(X, WELL)
 linear = RegularGridInterpolator((X, X), V2)
 zero_beyond = UnivariateSpline(X, WELL, s=0, ext=1)
@@ -155,3 +123,11 @@ zero_beyond = UnivariateSpline(X, WELL, s=0, ext=1)
 def test_what_is_not_recorded_says_why(V, d, message):
     with pytest.raises(TypeError, match=message):
         solve(HamiltonianSystem(V, ndof=d), "verlet", (0.0, 1.0), np.full(2 * d, 0.1), dt=0.1)
+
+
+def test_programs_with_tables_can_be_pickled():
+    system, _ = _system("CubicSpline")
+    program = pickle.loads(pickle.dumps(system.form.program))
+    q = np.linspace(-2.0, 2.0, 9)
+    np.testing.assert_array_equal(program(q)[0], system.form.program(q)[0])
+    assert str(program) == str(system.form.program)
