@@ -130,13 +130,6 @@ def test_functions_of_scipy_at_their_addresses(name):
         traced(lambda n: derivatives([apply("jv", n, 0.5)], [n])[0], "n")
 
 
-def test_the_derivative_of_a_power_by_its_exponent_and_of_a_constant_power():
-    (slope,) = traced(lambda x: derivatives([x**2.5], [x])[0], "x")(1.3)
-    assert slope == pytest.approx(2.5 * 1.3**1.5, rel=1e-15)
-    by_exponent = traced(lambda n: derivatives([2.0**n], [n])[0], "n")(1.5)[0]
-    assert by_exponent == pytest.approx(2**1.5 * np.log(2), rel=1e-15)
-
-
 def test_the_highest_derivative_of_the_logarithm_of_gamma_is_the_last():
     with pytest.raises(ValueError, match=r"^`polygamma` of the order 6 has no derivative here"):
         traced(lambda x: derivatives([apply("polygamma6", x)], [x])[0], "x")

@@ -139,7 +139,8 @@ def test_a_run_is_the_same_in_every_way(name, method, options, windows):
     if not options.get("compensated"):
         arrays = solve(system, method, span, y0, t_eval=times, backend="array")
         np.testing.assert_allclose(found.y, arrays.y, **close)
-        assert found.stats["force_evaluations"] == arrays.stats["force_evaluations"] or method.symplectic
+        counts = found.stats["force_evaluations"], arrays.stats["force_evaluations"]
+        assert counts[0] <= counts[1] if method.symplectic else counts[0] == counts[1]  # compiled kicks are merged
     if not method.arrays_only:
         tensors = solve(system, method, span, torch.tensor(y0), t_eval=times)
         assert tensors.stats["backend"] == "compiled"

@@ -5,41 +5,11 @@ import pytest
 import torch
 
 from sympflow import HamiltonianSystem, solve, systems
-from sympflow.compiler import NotCompiled
-from sympflow.integrators.loops import compiled_loops
-from sympflow.schemes import SCHEMES
 
 HH = systems.henon_heiles()
 PLAIN = HamiltonianSystem(lambda q: np.median(q, axis=-1) ** 4, ndof=1, y0=[1.0, 0.0], gradient=lambda q: 4 * q**3)
 TRACED = HamiltonianSystem(lambda q: (q**4).sum(-1), ndof=1, y0=[1.0, 0.0])
 AIRY = HamiltonianSystem.from_sympy("p**2/2 - airyai(q)", y0=[1.0, 0.0])
-
-
-@pytest.mark.parametrize("method", sorted(SCHEMES))
-def test_evaluations_are_counted_as_they_are_made(method):
-    calls = {"force": 0, "hessian": 0}
-
-    def gradient(q):
-        calls["force"] += 1
-        return q**3
-
-    def hessian_vector(q, v):
-        calls["hessian"] += 1
-        return 3 * q**2 * v
-
-    system = HamiltonianSystem(
-        lambda q: (q**4).sum(-1) / 4, gradient=gradient, hessian_vector=hessian_vector, ndof=1, check=False
-    )
-    sol = solve(system, method, (0.0, 1.0), y0=[1.0, 0.0], dt=0.1)
-    assert sol.stats["force_evaluations"] == calls["force"]
-    assert sol.stats["hessian_evaluations"] == calls["hessian"]
-
-
-def test_the_compiled_count_merges_the_last_kick_with_the_next_first():
-    dense = solve(HH, "verlet", (0.0, 10.0), dt=0.1)
-    sparse = solve(HH, "verlet", (0.0, 10.0), dt=0.1, t_eval=[10.0])
-    assert dense.nfev == 2 * 100
-    assert sparse.nfev == 100 + 1
 
 
 @pytest.mark.parametrize(
@@ -59,47 +29,8 @@ def test_auto_chooses_what_applies(system, arguments, backend):
     assert solve(system, "verlet", (0.0, 1.0), **arguments).stats["backend"] == backend
 
 
-@pytest.mark.parametrize(
-    ("system", "arguments", "message"),
-    [
-        (HH, {"backend": "compiled", "method": "rk45"}, r"^`backend` 'compiled' does not apply to method 'rk45'"),
-        (HH, {"backend": "compiled", "dtype": "float32"}, r"^`backend` 'compiled' does not apply. `y0` is float32"),
-        (
-            HH,
-            {"backend": "compiled", "y0": torch.tensor(HH.y0, requires_grad=True), "method": "tao4"},
-            r"^`backend` 'compiled' .* `y0` ",
-        ),
-        (PLAIN, {"backend": "compiled"}, r"^`backend` 'compiled' .* functions could not be traced: numpy\.median"),
-        (AIRY, {"backend": "compiled"}, r"^`backend` 'compiled' does not apply"),
-        (PLAIN, {"compensated": True}, r"^`compensated` sums need compiled loops"),
-        (HH, {"backend": "array", "compensated": True}, r"^`compensated` sums need compiled loops"),
-    ],
-)
-def test_a_backend_that_does_not_apply_says_why(system, arguments, message):
-    with pytest.raises(ValueError, match=message):
-        solve(system, **{"method": "verlet", "t_span": (0.0, 1.0), **arguments})
-
-
-def test_only_an_error_that_says_so_means_array_operations():
-    def refused():
-        raise NotCompiled("`system` has no loops.")
-
-    def broken():
-        raise ValueError("a fault of the loops")
-
-    assert compiled_loops(refused, np.zeros(2), "auto") is None
-    with pytest.raises(ValueError, match="a fault"):
-        compiled_loops(broken, np.zeros(2), "auto")
-
-
 @pytest.mark.parametrize("q", [1e12, 1e16, 1e18, 1e21, 1e100, 1e300])
 def test_sines_of_far_states_stay_bounded(q):
     sol = solve(systems.pendulum(), "verlet", (0.0, 0.01), y0=[q, 0.0], dt=0.01)
     assert sol.status == 0
     assert abs(sol.p[0, -1]) <= 0.01 * (1 + 1e-15)  # |force| <= 1
-
-
-def test_steps_are_counted_once():
-    sol = solve(HH, "verlet", (0.0, 10.0), dt=0.1, t_eval=[0.05, 10.0])
-    assert sol.stats["n_steps"] == 100
-    assert solve(HH, "verlet", (0.0, 10.03), dt=0.1).stats["n_steps"] == 101

@@ -8,7 +8,6 @@ import torch
 
 import sympflow
 from sympflow import systems
-from sympflow.interop.scipy import as_scipy
 
 pytestmark = pytest.mark.filterwarnings("ignore:`dt` .* is too long:RuntimeWarning")
 
@@ -18,17 +17,6 @@ H = "(q**2 + 1)*(p**2 + 1)/2"
 @pytest.fixture(scope="module")
 def system():
     return systems.nonseparable()
-
-
-@pytest.mark.slow
-def test_a_run_is_symplectic_on_the_two_copies_and_keeps_the_energy(system):
-    sol = sympflow.solve(system, "tao4", (0, 200), dt=0.05, t_eval=np.linspace(0, 200, 401))
-    assert sympflow.symplecticity_defect(sol) < 1e-13
-    assert abs(sympflow.volume_error(sol)) < 1e-10
-    error = np.abs(sol.energy_error())
-    assert error.max() < 1e-4
-    assert error[200:].max() < 2 * error[:200].max()  # no drift
-    assert sol.stats["copy_distance"] < 1e-2
 
 
 def test_events_and_dense_output_are_of_the_mean_of_the_copies(system):
@@ -62,16 +50,3 @@ def test_a_run_goes_back_is_thinned_and_pickled(system):
     t = np.linspace(0, 2, 7)
     np.testing.assert_array_equal(same.sol(t), forward.sol(t))
     assert sympflow.symplecticity_defect(same) < 1e-13
-
-
-def test_what_has_no_meaning_is_refused(system):
-    with pytest.raises(ValueError, match="`omega` must be positive"):
-        sympflow.solve(system, "tao4", omega=0.0)
-    with pytest.raises(ValueError, match="`omega` is for the splitting 'copies'"):
-        sympflow.solve(systems.pendulum(), "verlet", omega=1.0)
-    with pytest.raises(ValueError, match="composes Strang steps"):
-        sympflow.solve(system, sympflow.get("srkn6b")(splitting="copies"))
-    with pytest.raises(TypeError, match="keeps the second copy of phase space"):
-        as_scipy("tao4", system)
-    with pytest.raises(TypeError, match="cannot be undone"):
-        sympflow.get("tao4")(dt=0.1).inverse(system, 0.0, np.array([0.1, 0.2]), 0.1)

@@ -2,10 +2,8 @@
 
 import numpy as np
 import pytest
-import torch
 from scipy.interpolate import CubicSpline
 
-import sympflow
 from sympflow import HamiltonianSystem, get, solve
 
 made = HamiltonianSystem.from_sympy
@@ -52,45 +50,3 @@ def test_every_splitting_keeps_its_order(system, method, options):
         for dt in steps
     ]
     assert np.log2(errors[0] / errors[1]) > order - 0.35
-
-
-@pytest.mark.parametrize(("system", "method"), [(LINEAR, "linear_omelyan4"), (POLAR, "strang_parts")])
-def test_a_step_has_its_inverse_at_its_time(system, method):
-    integrator, t = get(method)(), np.array([0.4, 1.3])
-    y = np.stack([system.y0, 1.1 * np.asarray(system.y0)])
-    end = integrator.step(system, t, y, 0.1)
-    assert np.abs(end[1] - integrator.step(system, 1.3, y[1], 0.1)).max() < 1e-15
-    assert np.abs(integrator.inverse(system, t, end, 0.1) - y).max() < 1e-15
-
-
-def test_functions_of_the_time():
-    def H(t, q, p):
-        return (p[..., 0] ** 2 + 1) * (q[..., 0] ** 2 + 1) / 2 * (1 + 0.3 * torch.cos(1.3 * t)) + 0.2 * q[
-            ..., 0
-        ] * torch.sin(t)
-
-    def V(t, q):
-        return 8 * q[..., 0] ** 2 + q[..., 0] ** 4 / 4 * (1 + torch.sin(t))
-
-    scene = {"ndof": 1, "y0": [0.7, 0.3], **SCENE, "time": True}
-    given = HamiltonianSystem(hamiltonian=H, **scene)
-    omega, arrays = get("tao4")(omega=2.0), {"backend": "array"}
-    np.testing.assert_allclose(solve(given, omega).y, solve(COPIES, omega, **arrays).y, rtol=0, atol=1e-12)
-    stiff = HamiltonianSystem(V, stiffness_matrix=[[16.0]], **scene)
-    symbols = made("p**2/2 + 8*q**2 + q**4/4*(1 + sin(t))", y0=[0.7, 0.3], **SCENE)
-    np.testing.assert_allclose(solve(stiff, "impulse").y, solve(symbols, "impulse", **arrays).y, rtol=0, atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("ask", "message"),
-    [
-        (lambda: solve(made("p**2/2 + q**2*cos(t)/2", time="t", y0=[1, 0]), "impulse"), "do not depend on t"),
-        (lambda: made("p**2*cos(t) + q**2/2", time="t").linear_part, "do not depend on t"),
-        (lambda: solve(POLAR, "strang_parts", parts=TERMS[1:]), "^`parts` do not add up"),
-        (lambda: solve(LINEAR, "log_kahan_li8"), "'log_kahan_li8' does not take the time"),
-        (lambda: sympflow.SympFlow.split(LINEAR), "is driven, H depends on t, which primed flows take"),
-    ],
-)
-def test_what_does_not_apply_says_why(ask, message):
-    with pytest.raises(ValueError, match=message):
-        ask()

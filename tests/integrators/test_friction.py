@@ -1,23 +1,15 @@
 """Friction p' = −∂H/∂q − Γp: exact drifts, orders, conformal symplecticity; what leaves it out refuses it."""
 
-import pickle
-from dataclasses import dataclass
-from typing import ClassVar
-
 import numpy as np
 import pytest
 import scipy.linalg
 import torch
-import torchdiffeq
-from scipy.integrate import solve_ivp
 
 import sympflow
 from sympflow import HamiltonianSystem, solve
 from sympflow.hamiltonian.friction import Friction
-from sympflow.integrators.base import FixedStep
-from sympflow.interop.scipy import as_scipy
 from sympflow.schemes import SCHEMES
-from sympflow.systems import damped_oscillator, damped_pendulum, pendulum
+from sympflow.systems import damped_pendulum
 
 EVERY_SCHEME = pytest.mark.parametrize("name", SCHEMES)
 MATRIX = np.array([[0.5, 0.3], [0.3, 0.4]])
@@ -25,15 +17,6 @@ COUPLED = HamiltonianSystem.from_sympy(
     "p1**2/2 + p2**2/4 + p1*p2/5 + 1 - cos(q1 - q2) + q2**2/2 + q1**4/4", damping=MATRIX, y0=[0.7, -0.2, 0.3, 0.4]
 )
 """Γ and M⁻¹ that do not commute."""
-
-
-def oscillator(t, omega, rate, q0, p0):
-    """The known truth of `damped_oscillator`."""
-    W = np.sqrt(complex(omega**2 - rate**2 / 4))
-    A = np.array([[0.0, 1.0], [-(omega**2), -rate]])
-    q = np.exp(-rate * t / 2) * (q0 * np.cos(W * t) + (p0 + rate * q0 / 2) * np.sin(W * t) / W)
-    np.testing.assert_allclose(scipy.linalg.expm(A * t)[0] @ [q0, p0], q.real, atol=1e-12)
-    return scipy.linalg.expm(A * t) @ [q0, p0]
 
 
 # the system --------------------------------------------------------------------------------------------------------
@@ -61,37 +44,6 @@ def test_a_wrong_damping_is_refused(damping, error, says):
         HamiltonianSystem.from_sympy("p1**2/2 + p2**2/2 + q1**2 + q2**2", damping=damping)
     with pytest.raises(error, match=rf"^`damping` .*{says}"):
         HamiltonianSystem(lambda q: (q**2).sum(-1), ndof=2, damping=damping)
-
-
-def test_damping_is_kept_in_its_simplest_form_and_read_only():
-    def kept(damping):
-        return HamiltonianSystem.from_sympy("p1**2/2 + p2**2/2 + q1**2 + q2**2", damping=damping).damping
-
-    assert kept(None) is kept(0) is kept([0.0, 0.0]) is kept(np.zeros((2, 2))) is None
-    assert kept(0.1).shape == kept([0.1, 0.1]).shape == kept(0.1 * np.eye(2)).shape == ()
-    assert kept(np.diag([0.1, 0.0])).tolist() == [0.1, 0.0]
-    assert kept(MATRIX).tolist() == MATRIX.tolist()
-    for damping in (kept(0.1), kept([0.1, 0.2]), kept(MATRIX)):
-        with pytest.raises(ValueError, match="read-only"):
-            damping[...] = 1.0
-    with pytest.raises(AttributeError):
-        COUPLED.damping = None
-
-
-def test_the_system_tells_its_friction():
-    system = damped_pendulum(0.25)
-    assert not system.conservative
-    assert pendulum().conservative
-    assert damped_pendulum(0.0).conservative
-    assert "damping 0.25" in repr(system)
-    assert "damping" not in repr(pendulum())
-    again = pickle.loads(pickle.dumps(COUPLED))
-    assert again.damping.tolist() == MATRIX.tolist()
-    y = np.linspace(-1, 1, 12).reshape(3, 4)
-    assert np.array_equal(again.vector_field(y), COUPLED.vector_field(y))
-    prints = {damped_pendulum(rate).fingerprint for rate in (0.0, 0.1, 0.2)}
-    assert len(prints) == 3
-    assert damped_pendulum(0.0).fingerprint == pendulum().fingerprint
 
 
 @pytest.mark.parametrize("damping", [0.3, [0.3, 0.1], MATRIX])
@@ -148,63 +100,10 @@ def test_the_order_is_the_slope(name):
 
 
 @EVERY_SCHEME
-def test_the_damped_oscillator_is_solved_compiled(name):
-    system = damped_oscillator(2.0, 0.3)
-    sol = solve(system, name, (0, 3.0), dt=0.02)
-    assert sol.stats["backend"] == "compiled"
-    truth = oscillator(3.0, 2.0, 0.3, 1.0, 0.0)
-    close = {2: 2e-3, 4: 1e-4, 6: 1e-8, 8: 1e-11}[SCHEMES[name].order]
-    assert np.abs(sol.y[:, -1] - truth).max() < close
-    back = solve(system, name, (3.0, 0.0), truth, dt=0.02).y[:, -1]  # back in time it grows
-    assert np.abs(back - system.y0).max() < np.exp(0.3 * 3.0) * close
-    arrays = solve(system, name, (0, 3.0), dt=0.02, backend="array")
-    np.testing.assert_allclose(sol.y, arrays.y, atol=2e-14)
-
-
-@pytest.mark.parametrize("name", ["verlet", "leapfrog"])
-def test_a_compiled_matrix_and_batches(name):
-    y0 = np.stack([COUPLED.y0, -0.5 * COUPLED.y0, 0.1 * COUPLED.y0])
-    times = [0.13, 0.5, 0.97]  # between the steps too
-    compiled, arrays = (
-        solve(COUPLED, name, (0, 1.0), y0, dt=0.1, t_eval=times, backend=b) for b in ("compiled", "array")
-    )
-    np.testing.assert_allclose(compiled.y, arrays.y, atol=1e-14)
-    for i in range(3):
-        alone = solve(COUPLED, name, (0, 1.0), y0[i], dt=0.1, t_eval=times)
-        np.testing.assert_allclose(alone.y, arrays.y[i], atol=1e-14)
-
-
-@EVERY_SCHEME
 def test_steps_are_conformally_symplectic(name):
     sol = solve(damped_pendulum(0.3), name, (0, 5.0), dt=0.1, backend="array")
     assert sympflow.conformal_defect(sol) < 1e-13
     assert sympflow.conformal_defect(solve(damped_pendulum(0.3), "rk4", (0, 5.0), dt=0.1)) > 1e-9
-
-
-def test_the_conformal_defect_sees_another_rate():
-    sol = solve(damped_pendulum(0.3), "verlet", (0, 1.0), dt=0.1)
-    other = solve(damped_pendulum(0.31), "verlet", (0, 1.0), dt=0.1)
-    mixed = type(sol)(**{**vars(sol), "integrator": Stepping(other.system, dt=0.1)})
-    assert sympflow.conformal_defect(mixed) == pytest.approx(np.exp(-0.03) - np.exp(-0.031), rel=1e-6)
-    plain = solve(pendulum(), "verlet", (0, 1.0), dt=0.1)
-    assert sympflow.conformal_defect(plain) == sympflow.symplecticity_defect(plain)
-
-
-@dataclass(frozen=True)
-class Stepping(FixedStep):
-    """Verlet's steps of another system than the run's."""
-
-    other: HamiltonianSystem = None
-    name: ClassVar[str] = "of_another_system"
-    order: ClassVar[int] = 2
-    symplectic: ClassVar[bool] = False
-
-    def __init__(self, other, dt):
-        object.__setattr__(self, "other", other)
-        object.__setattr__(self, "dt", dt)
-
-    def step(self, system, t, y, h):
-        return sympflow.get("verlet")().step(self.other, t, y, h)
 
 
 @pytest.mark.parametrize("system", [COUPLED, damped_pendulum(0.4)], ids=["matrix", "number"])
@@ -234,63 +133,6 @@ def test_drifts_back_in_time_bound_the_step():
 
 
 # every method --------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("name", [m for m in sympflow.available() if not sympflow.get(m)().takes_friction])
-def test_methods_that_take_no_friction_refuse_it(name):
-    with pytest.raises(ValueError, match=r"^`system` 'damped_pendulum' has friction, .* use a splitting method"):
-        solve(damped_pendulum(0.5), name, (0, 1.0))
-
-
-class Field(FixedStep):
-    """A method of a third party that steps by the vector field and says nothing of friction."""
-
-    name: ClassVar[str] = "of_a_third_party"
-    order: ClassVar[int] = 1
-    symplectic: ClassVar[bool] = False
-
-    def step(self, system, t, y, h):
-        return y + h * system.vector_field(y)
-
-
-class Informed(Field):
-    @property
-    def takes_friction(self):
-        return True
-
-
-class Changed(sympflow.get("verlet")):
-    """A built-in method of which the step is another, that leaves friction out."""
-
-    def step(self, system, t, y, h):
-        d = system.ndof
-        p = y[..., d:] + h * system.force(y[..., :d])
-        return np.concatenate([y[..., :d] + h * system.velocity(p), p], axis=-1)
-
-
-def test_third_parties_say_that_they_take_friction():
-    system = damped_pendulum()
-    for method in (Field(dt=0.1), Changed(dt=0.1)):
-        with pytest.raises(ValueError, match="has friction"):
-            solve(system, method)
-    assert solve(system, Informed(dt=0.1), (0, 1.0)).success
-    assert solve(pendulum(), Changed(dt=0.1), (0, 1.0)).success
-
-
-def test_methods_of_peers_and_ours_within_them():
-    system = damped_pendulum(0.3)
-    truth = solve(system, "dop853", (0, 2.0), rtol=1e-12, atol=1e-13).y[:, -1]
-    theirs = solve_ivp(system, (0, 2.0), system.y0, method="Radau", rtol=1e-8, atol=1e-9)
-    ours = solve_ivp(system, (0, 2.0), system.y0, method=as_scipy("kahan_li8", system, dt=0.1))
-    np.testing.assert_allclose(theirs.y[:, -1], truth, atol=1e-7)
-    np.testing.assert_allclose(ours.y[:, -1], truth, atol=1e-9)
-    implicit = solve_ivp(system, (0, 2.0), system.y0, method=as_scipy("gauss_legendre6", system, dt=0.1))
-    np.testing.assert_allclose(implicit.y[:, -1], truth, atol=1e-8)
-    with pytest.raises(ValueError):
-        solve_ivp(pendulum(), (0, 2.0), system.y0, method=as_scipy("verlet", system, dt=0.1))
-    y0, t = torch.tensor(system.y0), torch.tensor([0.0, 2.0], dtype=torch.float64)
-    states = torchdiffeq.odeint(system, y0, t, method="dopri8", rtol=1e-9, atol=1e-10)
-    np.testing.assert_allclose(states[-1].numpy(), truth, atol=2e-6)
 
 
 # implicit methods, of any H ------------------------------------------------------------------------------------------
@@ -332,81 +174,4 @@ def test_gauss_methods_are_conformally_symplectic_for_any_h(name):
     assert sympflow.conformal_defect(sol) < 1e-14
 
 
-def test_compiled_gauss_methods_with_friction_are_those_of_arrays(ends):
-    (turning, _), (two, _), (coupled, _) = ends
-    for system in (turning, two):
-        y0 = np.stack([system.y0, 0.5 * system.y0])
-        compiled, arrays = (
-            solve(system, "gauss_legendre4", (0, 4.0), y0, dt=0.2, backend=backend) for backend in ("compiled", "array")
-        )
-        np.testing.assert_allclose(compiled.y, arrays.y, rtol=0, atol=1e-13)
-    back = solve(turning, "gauss_legendre4", (4.0, 0.0), solve(turning, "gauss_legendre4", (0, 4.0)).y[:, -1])
-    np.testing.assert_allclose(back.y[:, -1], turning.y0, atol=1e-12)
-    assert solve(coupled, "gauss_legendre4", (0, 0.4), dt=0.2).stats["backend"] == "numpy"
-    with pytest.raises(ValueError, match="is a matrix"):
-        solve(coupled, "gauss_legendre4", (0, 0.4), dt=0.2, backend="compiled")
-
-
 # what does not hold, or is for later --------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    "metric",
-    [
-        sympflow.energy_error,
-        sympflow.max_energy_error,
-        sympflow.energy_drift,
-        sympflow.volume_error,
-        sympflow.symplecticity_defect,
-        sympflow.loop_area_error,
-        lambda sol: sol.energy_error(),
-    ],
-)
-def test_what_friction_does_not_keep_is_not_measured(metric):
-    sol = solve(damped_pendulum(), "verlet", (0, 2.0))
-    with pytest.raises(ValueError, match=r"has friction, .*conformal_defect"):
-        metric(sol)
-
-
-def test_the_conformal_defect_is_for_one_rate():
-    with pytest.raises(ValueError, match="different rates"):
-        sympflow.conformal_defect(solve(COUPLED, "verlet", (0, 1.0), dt=0.1, backend="array"))
-
-
-def test_everything_else_refuses_friction():
-    damped, system = damped_pendulum(), pendulum()
-    flow = sympflow.shipped_flows(system)[0].load(system)
-    y = np.array([1.0, 0.5])
-    for use in (
-        lambda: sympflow.train(damped, kind="sympflow", steps=1),
-        lambda: sympflow.SympFlow.split(damped_oscillator(), 0.5),
-        lambda: solve(damped, flow),
-        lambda: solve(damped, "sympflow"),
-        lambda: solve(damped, "sympflow", flow=flow),
-        lambda: flow.check_system(damped),
-        lambda: flow.certificate(damped),
-        lambda: sympflow.time_transformed(damped),
-        lambda: damped_oscillator().linear_part,
-        lambda: sympflow.stability(damped, ["verlet"]),
-        lambda: sympflow.compare(damped, ["verlet"], ["volume"]),
-        lambda: sympflow.get("verlet")(splitting="copies").step(damped, 0.0, y, 0.1),
-        lambda: sympflow.get("strang_parts")().step(damped_oscillator(), 0.0, y, 0.1),
-        lambda: sympflow.get("log_leapfrog")().step(damped, 0.0, y, 0.1),
-    ):
-        with pytest.raises(ValueError, match="has friction"):
-            use()
-    assert not flow.matches(damped)
-    assert len(sympflow.shipped_flows(damped)) == 0
-    with pytest.raises(ValueError, match=r"^`compensated`"):
-        solve(damped, "verlet", compensated=True)
-    relativistic = HamiltonianSystem.from_sympy("sqrt(1 + p**2) - cos(q)", damping=0.1, y0=[1.0, 0.0])
-    with pytest.raises(ValueError, match=r"kinetic energy is ½ pᵀM⁻¹p"):
-        solve(relativistic, "verlet")
-
-
-def test_a_comparison_of_errors_has_a_reference():
-    report = sympflow.compare(
-        damped_pendulum(), ["verlet", "kahan_li8"], ["error"], repeats=1, n_outputs=10, t_span=(0, 5.0)
-    )
-    errors = {row.label: row.error for row in report.rows}
-    assert errors["kahan_li8"] < 1e-9 < errors["verlet"] < 1e-2

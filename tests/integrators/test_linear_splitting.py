@@ -4,11 +4,9 @@ from contextlib import nullcontext
 
 import numpy as np
 import pytest
-import torch
 
-from sympflow import HamiltonianSystem, get, max_energy_error, solve
-from sympflow.hamiltonian.parts import sheared, shears
-from sympflow.systems import fput, harmonic_oscillator, henon_heiles, spring_pendulum
+from sympflow import HamiltonianSystem, max_energy_error, solve
+from sympflow.systems import fput, harmonic_oscillator, spring_pendulum
 from sympflow.systems.chains import oscillatory_energies
 
 
@@ -26,22 +24,6 @@ def test_fput_figures():
     assert drift < 0.08
 
 
-def test_evaluations_are_those_of_the_scheme():
-    system = fput(omega=50.0)
-    assert solve(system, "linear_srkn11b", (0, 10), dt=0.1, t_eval=[10.0]).stats["force_evaluations"] == 1101
-    stats = solve(system, "impulse", (0, 10), dt=0.05, t_eval=[10.0], backend="array").stats
-    assert stats["force_evaluations"] == 400
-    assert all(type(stats[f"{kind}_evaluations"]) is int for kind in ("force", "hessian"))  # JSON takes no others
-
-
-def test_three_parts_of_the_polar_spring_pendulum():
-    system = spring_pendulum(1e6, coordinates="polar")
-    sol = solve(system, "strang_parts", (0, 20), dt=0.01)
-    H = sol.energy()
-    assert np.abs(H / H[0] - 1).max() < 1e-4
-    assert sol.stats["force_evaluations"] == pytest.approx(3 * 2000, abs=2001)
-
-
 def test_parts_given_by_the_user():
     system = spring_pendulum(1e4, coordinates="polar")
     parts = ("-g*q1*cos(q2)", "p2**2/(2*q1**2)", "p1**2/2 + k*(q1 - 1)**2/2")
@@ -53,38 +35,6 @@ def test_parts_given_by_the_user():
     assert np.abs(other.y - detected.y).max() > 1e-8
 
 
-@pytest.mark.parametrize(
-    ("parts", "message"),
-    [
-        (("p1**2/2 + k*(q1 - 1)**2/2", "p2**2/(2*q1**2)"), "do not add up to the Hamiltonian"),
-        (("p1**2/2 + k*(q1 - 1)**2/2 - g*q1*cos(q2)", "p2**2/(2*q1**2)"), "is not solved exactly"),
-    ],
-)
-def test_parts_that_will_not_do(parts, message):
-    with pytest.raises(ValueError, match=message):
-        solve(spring_pendulum(1e4, coordinates="polar"), "strang_parts", (0, 1), parts=parts)
-
-
-def test_a_term_with_a_conjugate_pair_is_refused():
-    system = HamiltonianSystem.from_sympy("(p**2 + 1)*(q**2 + 1)/2 + sin(q*p)", y0=[0.1, 0.2])
-    with pytest.raises(ValueError, match="does not split into parts"):
-        solve(system, "strang_parts", (0, 1), dt=0.1)
-
-
-def test_parts_that_are_no_sequence():
-    with pytest.raises(TypeError, match=r"^`parts` must be a sequence of expressions"):
-        get("strang_parts")(parts="q**2")
-
-
-def test_any_separable_system_splits_into_two():
-    """Without a linear part Strang's splitting is Verlet."""
-    from sympflow.systems import pendulum
-
-    one, other = (solve(pendulum(), name, (0, 5), dt=0.1).y for name in ("strang_parts", "verlet"))
-    assert np.abs(one - other).max() < 1e-13
-    assert np.abs(solve(henon_heiles(), "strang_parts", (0, 1), dt=0.1).y).max() < 1
-
-
 @pytest.mark.parametrize(("backend", "n"), [("compiled", 1_000_000), ("array", 5_000)])
 @pytest.mark.parametrize("turns", [0.25, 0.5, 1.0, 10.75, 1000.0])
 def test_whole_quarter_turns_leave_no_rounding_to_add_up(turns, backend, n):
@@ -94,40 +44,6 @@ def test_whole_quarter_turns_leave_no_rounding_to_add_up(turns, backend, n):
     sol = solve(oscillator, "impulse", (0.0, n * h), [1.0, 0.3], dt=h, t_eval=[(n - 4) * h, n * h], backend=backend)
     assert np.abs(sol.energy_error()).max() < 1e-15
     np.testing.assert_allclose(sol.y[:, -1], [1.0, 0.3], rtol=1e-15)
-
-
-@pytest.mark.parametrize(("backend", "n"), [("compiled", 1_000_000), ("array", 10_000)])
-@pytest.mark.parametrize("turn", [20.0, 1e3, np.pi / 3, 2 * np.pi / 5, np.pi / 2 + 1e-6, np.pi / 3 + 1e-6])
-def test_rounding_of_the_turn_is_a_random_walk(turn, backend, n):
-    """√n of the half ulp that each of three shears may be off; where the state recurs every step adds up instead."""
-    y0 = np.random.default_rng(0).normal(size=(8, 2))
-    sol = solve(harmonic_oscillator(), "impulse", (0, n * turn), y0, dt=turn, t_eval=[n * turn], backend=backend)
-    eps = np.finfo(float).eps
-    # a sixth of a turn is the worst of the simple fractions: a recurring error of less than eps/3 a step
-    assert np.abs(sol.energy_error()).max() < (n / 3 if turn == np.pi / 3 else 3 * np.sqrt(n)) * eps
-
-
-def test_the_angle_of_a_turn_is_that_of_the_exact_product():
-    """Ω s is kept to twice the precision: at hω = 1000 its rounding alone would be 1e-13 of a radian a step."""
-    from fractions import Fraction
-
-    t, sigma, c, d = shears(["oscillator"], np.array([1000.1]), np.array([1.0003]))
-    theta = Fraction(1000.1) * Fraction(1.0003)
-    pi = Fraction(31415926535897932384626433832795028841971693993751, 10**49)
-    quarters = round(theta / (pi / 2))
-    r = float(theta - quarters * pi / 2)
-    assert (c[0], d[0]) == [(1, 0), (0, 1), (-1, 0), (0, -1)][quarters % 4]
-    assert sigma[0] == pytest.approx(np.sin(r), rel=4e-16)
-    assert t[0] == pytest.approx(np.tan(r / 2), rel=4e-16)
-
-
-@pytest.mark.parametrize("theta", [0.3, 1.0, 2.5, np.pi / 2, np.pi, -7.0])
-def test_the_turn_is_differentiable_in_its_angle_at_whole_quarters_too(theta):
-    angle = torch.tensor([theta], dtype=torch.float64, requires_grad=True)
-    rate, X, Y = torch.ones(1, dtype=torch.float64), torch.tensor([0.3]).double(), torch.tensor([-0.8]).double()
-    x, y = sheared(X, Y, shears(["oscillator"], rate, angle))
-    slopes = [torch.autograd.grad(value.sum(), angle, retain_graph=True)[0] for value in (x, y)]
-    torch.testing.assert_close(torch.stack(slopes), torch.stack([y, -x]).detach(), rtol=0, atol=1e-14)
 
 
 @pytest.mark.parametrize(("name", "of_step", "of_kicks"), [("aba864", 8, 1), ("aba1064", 6, 2), ("aba104", 4, 2)])

@@ -2,47 +2,24 @@
 
 import numpy as np
 import pytest
-import torch
 
 from sympflow import (
     ClockedFit,
     HamiltonianSystem,
-    SympFlow,
-    compare,
     get,
     load,
     max_energy_error,
-    poincare_section,
     shipped_flows,
     solve,
     systems,
     time_transformed,
     train,
 )
-from sympflow.flow.clocked import ClockedFlow
-from sympflow.flow.shipped import choose
-from sympflow.hamiltonian.time_transformation import lifted
 from sympflow.integrators.base import Problem
 from sympflow.integrators.clocks import PhysicalRun
 from sympflow.integrators.flows import LogSympFlow
 from sympflow.interop.scipy import as_scipy
 from sympflow.systems.celestial import kepler_ellipse
-
-METHODS = ("log_leapfrog", "log_blanes_moan4", "log_kahan_li8")
-EPS = np.finfo(float).eps
-
-MASSES, PLACES = (3, 4, 5), ((1, 3), (-2, -1), (1, -1))
-PYTHAGOREAN = HamiltonianSystem.from_sympy(
-    "+".join(f"(p{2 * i + 1}**2 + p{2 * i + 2}**2)/{2 * MASSES[i]}" for i in range(3))
-    + "".join(
-        f" - {MASSES[i] * MASSES[j]}/sqrt((q{2 * i + 1} - q{2 * j + 1})**2 + (q{2 * i + 2} - q{2 * j + 2})**2)"
-        for i in range(3)
-        for j in range(i + 1, 3)
-    ),
-    y0=[*np.ravel(PLACES), *[0.0] * 6],
-    t_span=(0.0, 70.0),
-    dt=1e-3,
-)
 
 
 @pytest.mark.parametrize("e", [0.9, 0.99, 0.999])
@@ -57,56 +34,6 @@ def test_the_leapfrog_stays_on_the_ellipse(e):
     assert np.abs(r + e * q1 - (1 - e * e)).max() < 1e-9
 
 
-@pytest.mark.parametrize(("method", "order"), [("log_leapfrog", 2), ("log_blanes_moan4", 4)])
-def test_outputs_are_at_physical_times(method, order):
-    e, kepler, period = 0.9, systems.kepler(0.9), 2 * np.pi
-    anomaly = np.linspace(0, 2 * np.pi, 9)
-    times = anomaly - e * np.sin(anomaly)
-    errors = [
-        np.abs(solve(kepler, method, (0, period), dt=period / n, t_eval=times).y.T - kepler_ellipse(e, anomaly))
-        for n in (400, 800)
-    ]
-    assert errors[1].max() < errors[0].max() / 2 ** (order - 0.3)
-
-
-def test_the_time_of_an_output_is_met_to_rounding():
-    # where the ellipse is followed exactly, the state tells the time that the leapfrog has for it
-    kepler = systems.kepler(0.9)
-    transformed = time_transformed(kepler)
-    run = solve(transformed, "leapfrog", (0.0, 2.0), dt=0.01)
-    t, y = run.y[2], run.y[[0, 1, 3, 4]]
-    sol = solve(kepler, "log_leapfrog", (0.0, float(t[-1])), dt=0.01, t_eval=t)  # ds = dt·2|E| = dt
-    speed = np.abs(np.diff(y) / np.diff(t)).max()
-    assert np.abs(sol.y - y).max() < 1e-12 * speed
-    assert np.array_equal(sol.t, t)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("method", METHODS)
-def test_a_close_binary_and_its_escape(method):
-    limits = {"log_leapfrog": (1e-3, None), "log_blanes_moan4": (1e-5, 0.1), "log_kahan_li8": (1e-9, 1e-2)}
-    energy, state = limits[method]
-    sol = solve(PYTHAGOREAN, method, t_eval=[15.83, 35.0, 70.0])
-    assert max_energy_error(sol) < energy
-    reference = [6.933464, 20.261804, -2.003006, -6.872463, -2.557673, -6.659112]  # 128-bit arithmetic
-    if state is not None:
-        assert np.abs(sol.q[:, -1] - reference).max() < state
-
-
-def test_float32_and_functions_run_with_arrays():
-    kepler = systems.kepler(0.6)
-    functions = HamiltonianSystem(
-        potential=lambda q: -1 / (q**2).sum(-1).sqrt(), ndof=2, y0=kepler.y0, dt=kepler.dt, name="functions"
-    )
-    times = [0.0, 1.0, 7.0]
-    reference = solve(kepler, "log_leapfrog", (0.0, 7.0), dt=0.02, t_eval=times)
-    sol = solve(functions, "log_leapfrog", (0.0, 7.0), dt=0.02, t_eval=times)
-    np.testing.assert_allclose(sol.y, reference.y, rtol=0, atol=1e-11)
-    single = solve(kepler, "log_leapfrog", (0.0, 7.0), dt=0.02, t_eval=times, dtype="float32")
-    assert single.y.dtype == np.float32
-    np.testing.assert_allclose(single.y, reference.y, rtol=0, atol=1e-3)
-
-
 def test_the_transformed_functions_are_the_derivatives_of_each_other():
     functions = HamiltonianSystem(
         potential=lambda q: -1 / (q**2).sum(-1).sqrt(), ndof=2, y0=systems.kepler(0.6).y0, name="functions"
@@ -116,6 +43,75 @@ def test_the_transformed_functions_are_the_derivatives_of_each_other():
     for name in ("hamiltonian", "gradient", "hessian"):
         np.testing.assert_allclose(getattr(plain, name)(x), getattr(symbolic, name)(x), rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(symbolic.hamiltonian(symbolic.y0), 0.0, atol=1e-14)
+
+
+def test_a_collision_ends_the_run_with_its_time():
+    kepler = systems.kepler(0.9)
+    with pytest.warns(RuntimeWarning, match=r"about t = 1\.110720734, by a collision"):  # π/√8, into the centre
+        sol = solve(kepler, "log_leapfrog", (0.0, 10.0), y0=[1.0, 0.0, 0.0, 0.0])
+    assert sol.status in (0, -1)
+    assert np.isfinite(sol.y).all()
+    escape = solve(systems.henon_heiles(), "log_leapfrog", (0.0, 10.0), y0=[0.0, 0.0, 0.0, 0.7], dt=0.2)
+    assert escape.status == -1
+    assert "time hardly advances any more" in escape.message
+    assert escape.t[-1] <= escape.stats["failed_at"] < 5.450984210235402
+
+
+# flows with a trained clock ------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def clocked():
+    return train(systems.kepler(), ClockedFit(1.0))
+
+
+def test_the_clock_learns_how_late_the_leapfrog_is(clocked):
+    """2 z³ a^(3/2) (1/3 − z²/5 + z⁴/7 − …), z = s/(2√a), a = 1/(2B): the time that it is ahead of 2 arctan z."""
+    np.testing.assert_allclose(clocked.clock.numbers[:3], [-1 / 12, 1 / 40, -1 / 112], rtol=1e-4)
+    assert clocked.figures["one_step_error_max"] < 1e-11  # labels to 1e-13, times the speed near the pericentre
+    assert clocked.figures["fractional_error"] <= clocked.figures["one_step_error"]
+
+
+def test_it_is_right_in_the_physical_time(clocked):
+    e, kepler = 0.6, systems.kepler()
+    anomaly = np.linspace(0.0, 40 * np.pi, 61)
+    times = anomaly - e * np.sin(anomaly)
+    sol = solve(kepler, LogSympFlow(flow=clocked), (0.0, times[-1]), t_eval=times)
+    # rounding in t, 1e-14 a step, times the largest speed, 2, and acceleration, 6
+    np.testing.assert_allclose(sol.y.T, kepler_ellipse(e, anomaly), rtol=0, atol=1e-11)
+    dense = solve(kepler, LogSympFlow(flow=clocked), (0.0, times[-1]), dense_output=True)
+    np.testing.assert_allclose(dense.sol(times).T, kepler_ellipse(e, anomaly), rtol=0, atol=1e-11)
+
+
+def test_a_flow_in_another_time_is_asked_for_by_name_or_by_a_tolerance_that_no_other_meets():
+    kepler = systems.kepler()
+    anomaly = np.linspace(0.0, 6 * np.pi, 7)
+    times = anomaly - 0.6 * np.sin(anomaly)
+    flow = next(f for f in shipped_flows(kepler) if f.shift is not None)
+    for options in ({"flow": flow.name}, {"flow": flow.load(kepler)}, {"tol": 1e-10}):
+        sol = solve(kepler, "sympflow", (0.0, times[-1]), t_eval=times, **options)
+        assert sol.integrator.name == "log_sympflow"
+        np.testing.assert_allclose(sol.y.T, kepler_ellipse(0.6, anomaly), rtol=0, atol=1e-11)
+    with pytest.raises(ValueError, match=r"^`system` 'kepler' .* in another time: pass time_transformed\(system, 0\)"):
+        load(flow.path, system=kepler)
+    with pytest.raises(ValueError, match=r"^`compensated`"):
+        solve(kepler, "sympflow", (0.0, 1.0), flow=flow.name, compensated=True)
+    with pytest.raises(ValueError, match=r"^`tol` 1e-20 is not met by any flow"):
+        solve(kepler, "sympflow", (0.0, 1.0), tol=1e-20)
+
+
+@pytest.mark.parametrize("dt", [None, 0.5])
+def test_dt_is_the_mean_physical_step_by_the_clock_of_the_flow(clocked, dt):
+    """Over whole periods: the orbit is followed exactly, in equal steps of the eccentric anomaly."""
+    t_end = 200 * np.pi
+    sol = solve(systems.kepler(), LogSympFlow(flow=clocked, dt=dt), (0.0, t_end), t_eval=[t_end])
+    assert abs(sol.stats["n_steps"] - t_end / sol.stats["dt"]) <= 1
+    assert dt in (None, sol.stats["dt"])
+    with pytest.raises(ValueError, match=r"^`dt` must be at most 0\.92"):  # 2 atan(1/2) of the anomaly
+        solve(systems.kepler(), LogSympFlow(flow=clocked, dt=0.95), (0.0, 1.0))
+
+
+EPS = np.finfo(float).eps
 
 
 @pytest.mark.parametrize("method", ["log_leapfrog", "log_blanes_moan4", "clocked"])
@@ -140,210 +136,6 @@ def test_few_kept_states_give_the_outputs_of_all(method, t_end, clocked):
             assert made.stats["n_steps"] == expected.stats["n_steps"]
 
 
-@pytest.mark.parametrize("sign", [1, -1])
-def test_events_are_found_in_physical_time(sign):
-    """An orbit of period 2π crosses its axis each half of it."""
-    sol = solve(systems.kepler(0.9), "log_kahan_li8", (0.0, sign * 20.0), events=lambda t, y: y[1])
-    np.testing.assert_allclose(sol.t_events[0], sign * np.pi * np.arange(7), rtol=0, atol=1e-9)
-
-
-def test_a_trajectory_of_a_batch_is_the_one_alone(monkeypatch):
-    kepler, options = systems.kepler(), {"t_span": (0.0, 40.0), "t_eval": [13.0, 40.0], "dt": 0.1}
-    y0 = kepler.domain.sample(40, 2)
-    alone = [solve(kepler, "log_leapfrog", y0=y, **options).y for y in y0]
-    monkeypatch.setattr("sympflow.integrators.clocks.LARGEST_CHUNK", 4000)  # so that chunks are others
-    np.testing.assert_array_equal(solve(kepler, "log_leapfrog", y0=y0, **options).y, alone)
-
-
-def test_a_run_ends_with_its_last_output():
-    kepler = systems.kepler()
-    whole, part = (solve(kepler, "log_leapfrog", (0.0, end), t_eval=[2.0], dt=0.1) for end in (2.0, 2000.0))
-    np.testing.assert_array_equal(whole.y, part.y)
-    assert whole.stats["n_steps"] == part.stats["n_steps"]
-
-
-def test_a_collision_ends_the_run_with_its_time():
-    kepler = systems.kepler(0.9)
-    with pytest.warns(RuntimeWarning, match=r"about t = 1\.110720734, by a collision"):  # π/√8, into the centre
-        sol = solve(kepler, "log_leapfrog", (0.0, 10.0), y0=[1.0, 0.0, 0.0, 0.0])
-    assert sol.status in (0, -1)
-    assert np.isfinite(sol.y).all()
-    escape = solve(systems.henon_heiles(), "log_leapfrog", (0.0, 10.0), y0=[0.0, 0.0, 0.0, 0.7], dt=0.2)
-    assert escape.status == -1
-    assert "time hardly advances any more" in escape.message
-    assert escape.t[-1] <= escape.stats["failed_at"] < 5.450984210235402
-
-
-@pytest.mark.parametrize("method", [METHODS[0], *(pytest.param(m, marks=pytest.mark.slow) for m in METHODS[1:])])
-def test_force_evaluations_on_arrays_are_bounded_before_a_singularity(method):
-    """Time hardly advances: 20,000 evaluations, and those of 6 steps (at least 50) for each dt in the interval."""
-    system, length = systems.henon_heiles(), 6.0
-    sol = solve(system, method, (0.0, length), y0=[0.0, 0.0, 0.0, 0.7], backend="array")
-    stages = sol.stats["force_evaluations"] / sol.stats["n_steps"]
-    most = 20_000 + max(50, 6 * stages) * length / system.dt
-    assert sol.status == -1
-    assert "time hardly advances any more" in sol.message
-    assert most - stages <= sol.stats["force_evaluations"] <= most
-    batch = solve(system, method, (0.0, 6.0), y0=[[0, 0, 0, 0.7], [0, 0, 0, 0.1]], backend="array", t_eval=[1.0, 6.0])
-    assert batch.status.tolist() == [-1, 0]
-    assert batch.stats["n_steps"] <= most / stages
-
-
-@pytest.mark.parametrize("backend", ["array", "auto"])
-@pytest.mark.slow
-def test_states_of_an_infinite_energy(backend):
-    """V that overflows is refused; T that does is a run that fails at its start, whatever is asked of it."""
-    system, still = systems.henon_heiles(), [0.0, 0.0, 0.0]
-    for y0 in ([0.0, -2e154, 0.0, 0.0], [0.0, -1e200, 0.0, 1e200], [[*still, 0.1], [0.0, -1e308, 0.0, 0.0]]):
-        with pytest.raises(ValueError, match=r"^`y0` has the energy inf: give a state of a finite one\."):
-            solve(system, "log_leapfrog", (0.0, 0.2), y0=y0, backend=backend)
-    for asked in ({}, {"t_eval": [0.1, 0.2]}, {"dense_output": True}):
-        sol = solve(system, "log_leapfrog", (0.0, 0.2), y0=[*still, 2e154], backend=backend, **asked)
-        assert (sol.status, sol.stats["failed_at"]) == (-1, 0.0)
-    batch = solve(system, "log_leapfrog", (0.0, 0.2), y0=[[*still, 0.1], [*still, 2e154]], backend=backend)
-    assert batch.status.tolist() == [0, -1]
-
-
-def test_bad_shifts_and_systems_are_refused():
-    with pytest.raises(
-        ValueError, match=r"^`shift` 0.1 does not exceed the potential at `y0`.*give one above the energy"
-    ):
-        solve(systems.henon_heiles(), "log_leapfrog", (0, 1), y0=[0.9, -0.4, 0, 0], shift=0.1)
-    with pytest.raises(ValueError, match=r"is not separable, so its logarithmic Hamiltonian is not either"):
-        solve(HamiltonianSystem.from_sympy("(p**2+1)*(q**2+1)", y0=[0, 1]), "log_leapfrog")
-    with pytest.raises(TypeError, match=r"^`y0` is a tensor"):
-        solve(systems.kepler(), "log_leapfrog", (0, 1), y0=torch.tensor(systems.kepler().y0))
-
-
-def test_a_sympflow_on_the_transformed_system_runs_in_physical_time():
-    kepler = systems.kepler(0.9)
-    transformed = time_transformed(kepler)
-    flow = SympFlow.primed(transformed, scheme="blanes_moan4", dt=0.02)  # untrained: the scheme itself
-    times = np.linspace(0.0, 20.0, 11)
-    sol = solve(kepler, LogSympFlow(flow=flow), (0.0, 20.0), t_eval=times)
-    scheme = solve(kepler, "log_blanes_moan4", (0.0, 20.0), dt=0.02, t_eval=times)
-    np.testing.assert_allclose(sol.y, scheme.y, rtol=0, atol=1e-9)
-    with pytest.raises(ValueError, match=r"^`dt` must be at most 0.02"):
-        solve(kepler, LogSympFlow(flow=flow, dt=0.03), (0.0, 1.0))
-    with pytest.raises(ValueError, match=r"^`flow` is needed"):
-        solve(systems.pendulum(), LogSympFlow(), (0.0, 1.0))
-
-
-# flows with a trained clock ------------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def clocked():
-    return train(systems.kepler(), ClockedFit(1.0))
-
-
-def rows(n=5):
-    kepler = systems.kepler()
-    return lifted(kepler, kepler.domain.sample(n, 7), 0.0)
-
-
-def test_the_clock_learns_how_late_the_leapfrog_is(clocked):
-    """2 z³ a^(3/2) (1/3 − z²/5 + z⁴/7 − …), z = s/(2√a), a = 1/(2B): the time that it is ahead of 2 arctan z."""
-    np.testing.assert_allclose(clocked.clock.numbers[:3], [-1 / 12, 1 / 40, -1 / 112], rtol=1e-4)
-    assert clocked.figures["one_step_error_max"] < 1e-11  # labels to 1e-13, times the speed near the pericentre
-    assert clocked.figures["fractional_error"] <= clocked.figures["one_step_error"]
-
-
-def test_compiled_clocks_agree_with_the_layers(clocked):
-    x, kernel = rows(), clocked.kernel_for(clocked.system)
-    s = np.array([0.1, 0.4, 0.7, 0.9, 1.0])
-    with torch.no_grad():
-        there = clocked.psi(torch.from_numpy(s), torch.from_numpy(x)).numpy()
-        back = clocked.psi_inverse(torch.from_numpy(s), torch.from_numpy(x)).numpy()
-        two = clocked.psi(0.5, clocked.psi(0.5, torch.from_numpy(x))).numpy()
-    np.testing.assert_allclose(kernel.step(s, x).states, there, rtol=1e-13, atol=1e-13)
-    np.testing.assert_allclose(kernel.step(-s, x).states, back, rtol=1e-13, atol=1e-13)
-    np.testing.assert_allclose(kernel.run(0.5, x, 2, np.array([2]))[0][:, 0], two, rtol=1e-13, atol=1e-13)
-    np.testing.assert_allclose(kernel.run(0.5, x[0], 2, np.array([2]))[0][0], two[0], rtol=1e-13, atol=1e-13)
-
-
-def test_it_is_right_in_the_physical_time(clocked):
-    e, kepler = 0.6, systems.kepler()
-    anomaly = np.linspace(0.0, 40 * np.pi, 61)
-    times = anomaly - e * np.sin(anomaly)
-    sol = solve(kepler, LogSympFlow(flow=clocked), (0.0, times[-1]), t_eval=times)
-    # rounding in t, 1e-14 a step, times the largest speed, 2, and acceleration, 6
-    np.testing.assert_allclose(sol.y.T, kepler_ellipse(e, anomaly), rtol=0, atol=1e-11)
-    dense = solve(kepler, LogSympFlow(flow=clocked), (0.0, times[-1]), dense_output=True)
-    np.testing.assert_allclose(dense.sol(times).T, kepler_ellipse(e, anomaly), rtol=0, atol=1e-11)
-
-
-@pytest.mark.slow
-def test_a_tolerance_takes_it_where_it_is_the_faster_one():
-    kepler = systems.kepler()
-    assert choose(kepler, tol=1e-8, transformed=True).shift == 0.0
-    assert choose(kepler, tol=1e-8).shift is None
-    long = solve(kepler, "sympflow", (0.0, 2000.0), tol=1e-8, t_eval=[1000.0, 2000.0])
-    assert long.integrator.name == "log_sympflow"
-    assert max_energy_error(long) < 1e-12
-    for options in ({"t_span": (0.0, 1.0)}, {"t_span": (0.0, 2000.0), "compensated": True, "t_eval": [2000.0]}):
-        assert solve(kepler, "sympflow", tol=1e-8, **options).integrator.name == "sympflow"
-    rows = kepler.domain.sample(30, seed=1)
-    for times, name in ((2, "log_sympflow"), (400, "sympflow")):  # in another time each output is searched for
-        options = {"y0": rows, "t_eval": np.linspace(0.0, 400.0, times)}
-        assert solve(kepler, "sympflow", (0.0, 400.0), tol=1e-6, **options).integrator.name == name
-    tensor = torch.as_tensor(kepler.y0)
-    assert isinstance(solve(kepler, "sympflow", (0.0, 0.1), y0=tensor, tol=1e-8).y, torch.Tensor)
-    with pytest.raises(ValueError, match=r"^`y0` is outside the domain"):
-        solve(kepler, "sympflow", (0.0, 2000.0), y0=systems.kepler(0.1).y0, tol=1e-8)
-
-
-def test_clocked_flows_are_kept_in_files(clocked, tmp_path):
-    clocked.save(tmp_path / "f.safetensors")
-    with pytest.raises(ValueError, match=r"^`flow` is primed with the V and T"):
-        load(tmp_path / "f.safetensors").psi(0.5, torch.from_numpy(rows()))
-    flow = load(tmp_path / "f.safetensors", system=time_transformed(systems.kepler()))
-    x = torch.from_numpy(rows())
-    assert torch.equal(flow.psi(0.5, x), clocked.psi(0.5, x))
-    with pytest.raises(ValueError, match=r"^`system` 'kepler'"):
-        load(tmp_path / "f.safetensors", system=systems.kepler())
-
-
-def test_schemes_and_systems_without_a_clock_are_refused():
-    with pytest.raises(ValueError, match=r"^`scheme` 'chin4a' is not a symmetric one without force gradients"):
-        ClockedFlow(3, "chin4a")
-    with pytest.raises(ValueError, match=r"^`system` is not a logarithmic Hamiltonian"):
-        ClockedFlow(2, system=systems.kepler())
-    with pytest.raises(ValueError, match=r"^`terms` must be a positive integer"):
-        ClockedFlow(3, terms=0)
-    with pytest.raises(ValueError, match=r"^`domain` is not known for the system 'plain'"):
-        train(HamiltonianSystem.from_sympy("p**2/2 - 1/sqrt(1 + q**2)", name="plain"), ClockedFit(0.1))
-
-
-def test_a_flow_in_another_time_is_asked_for_by_name_or_by_a_tolerance_that_no_other_meets():
-    kepler = systems.kepler()
-    anomaly = np.linspace(0.0, 6 * np.pi, 7)
-    times = anomaly - 0.6 * np.sin(anomaly)
-    flow = next(f for f in shipped_flows(kepler) if f.shift is not None)
-    for options in ({"flow": flow.name}, {"flow": flow.load(kepler)}, {"tol": 1e-10}):
-        sol = solve(kepler, "sympflow", (0.0, times[-1]), t_eval=times, **options)
-        assert sol.integrator.name == "log_sympflow"
-        np.testing.assert_allclose(sol.y.T, kepler_ellipse(0.6, anomaly), rtol=0, atol=1e-11)
-    with pytest.raises(ValueError, match=r"^`system` 'kepler' .* in another time: pass time_transformed\(system, 0\)"):
-        load(flow.path, system=kepler)
-    with pytest.raises(ValueError, match=r"^`compensated`"):
-        solve(kepler, "sympflow", (0.0, 1.0), flow=flow.name, compensated=True)
-    with pytest.raises(ValueError, match=r"^`tol` 1e-20 is not met by any flow"):
-        solve(kepler, "sympflow", (0.0, 1.0), tol=1e-20)
-
-
-def test_comparisons_and_sections_take_what_solve_takes():
-    kepler, exact = systems.kepler(), get("sympflow")(tol=1e-10)
-    row = compare(kepler, [("flow", exact)], t_span=(0.0, 20.0), metrics=("energy",), repeats=1).rows[0]
-    assert row.status == "ok"
-    assert row.training_time is not None
-    assert row.energy_error < 1e-12
-    section = poincare_section(kepler, exact, (0.0, 20.0))
-    # q1 = 0 on the ellipse: cos E = e, upwards before the perihelion
-    anomaly = 2 * np.pi * np.arange(1, 4) - np.arccos(0.6)
-    np.testing.assert_allclose(section.t, anomaly - 0.6 * np.sin(anomaly), rtol=0, atol=1e-11)
-
-
 def test_the_name_that_a_run_in_another_time_reports_is_a_name_to_call_it_by():
     kepler = systems.kepler()
     by_flow = solve(kepler, "sympflow", (0.0, 5.0), flow="kepler-log-1")
@@ -357,24 +149,3 @@ def test_the_name_that_a_run_in_another_time_reports_is_a_name_to_call_it_by():
         solve(kepler, "log_sympflow", (0, 1), flow=3)
     with pytest.raises(TypeError, match=r"^`flow` runs in another time.* SciPy cannot drive: use solve\(\)"):
         as_scipy("sympflow", kepler, flow="kepler-log-1")
-
-
-def test_a_tol_that_only_another_time_meets_says_what_that_needs():
-    kepler = systems.kepler()
-    where = r"^`tol` 1e-09 is not met by any flow .* can run here .*kepler-log-1 meets it, .* NumPy arrays of float64"
-    for y0, dtype in ((torch.tensor(kepler.y0), None), (kepler.y0, "float32")):
-        with pytest.raises(ValueError, match=where):
-            solve(kepler, "sympflow", (0, 1), y0, dtype=dtype, tol=1e-9)
-    with pytest.raises(ValueError, match=where):
-        as_scipy("sympflow", kepler, tol=1e-9)
-
-
-@pytest.mark.parametrize("dt", [None, 0.5])
-def test_dt_is_the_mean_physical_step_by_the_clock_of_the_flow(clocked, dt):
-    """Over whole periods: the orbit is followed exactly, in equal steps of the eccentric anomaly."""
-    t_end = 200 * np.pi
-    sol = solve(systems.kepler(), LogSympFlow(flow=clocked, dt=dt), (0.0, t_end), t_eval=[t_end])
-    assert abs(sol.stats["n_steps"] - t_end / sol.stats["dt"]) <= 1
-    assert dt in (None, sol.stats["dt"])
-    with pytest.raises(ValueError, match=r"^`dt` must be at most 0\.92"):  # 2 atan(1/2) of the anomaly
-        solve(systems.kepler(), LogSympFlow(flow=clocked, dt=0.95), (0.0, 1.0))

@@ -1,17 +1,14 @@
 """Derivatives and transforms of torch through `odeint`, `solve` and flows: right, or refused, never silently zero."""
 
-from functools import partial
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
 from torch.autograd import forward_ad
 from torch.autograd.functional import jacobian
-from torch.func import functional_call, grad, hessian, jacfwd, jacrev, jvp, vjp, vmap
+from torch.func import grad, hessian, jacfwd, jacrev, jvp, vjp, vmap
 
 from sympflow import HamiltonianSystem, MLPFlow, SympFlow, get, solve, systems
-from sympflow.interop.torchdiffeq import odeint, odeint_dense, odeint_event
+from sympflow.interop.torchdiffeq import odeint, odeint_event
 
 PENDULUM, OSCILLATOR = systems.pendulum(), systems.harmonic_oscillator()
 KINDS = ["verlet", "kahan_li8", "chin4a", "gauss_legendre4", "strang_parts", "mollified_impulse", "sympflow", "mlp"]
@@ -55,31 +52,6 @@ def problem(method):
         return solve(system, method, (0.0, 0.7), y, t_eval=[0.25, 0.7], on_domain_exit="ignore", **chosen).y[..., -1]
 
     return by_odeint, by_solve
-
-
-DOCUMENTED = {
-    "`backward`, `torch.autograd.grad`": ["backward"],
-    "dual tensors, `torch.autograd.forward_ad`": ["dual tensors"],
-    "`torch.autograd.functional.jacobian`, both strategies": ["jacobian, forward mode", "jacobian, vectorized"],
-    "`torch.func.grad`, `vjp`, `jacrev`": ["grad", "vjp", "jacrev"],
-    "`torch.func.jvp`, `jacfwd`": ["jvp", "jacfwd"],
-    "`torch.func.hessian`": ["TestEveryTransform.test_derivatives_in_y0"],
-    "`torch.func.vmap`, of these too": ["TestEveryTransform.test_vmap"],
-    "`torch.func.functional_call`": ["TestFlows.test_functional_weights"],
-    "`torch.compile(fullgraph=True)`": ["TestCompiled.test_steps", "TestCompiled.test_whole_runs_are_refused"],
-}
-"""The rows of the table in docs/plugins-and-interop.md, and what executes them: derivatives above, and tests below."""
-
-
-def test_every_row_of_the_documented_table_is_executed():
-    page = (Path(__file__).parents[2] / "docs" / "plugins-and-interop.md").read_text(encoding="utf-8")
-    table = page.partition("| transform |")[2].partition("\n\n")[0]
-    rows = [line.split("|")[1].strip() for line in table.splitlines()[2:]]
-    assert rows == list(DOCUMENTED)
-    for names in DOCUMENTED.values():
-        for name in names:
-            cls, _, test = name.partition(".")
-            assert name in DERIVATIVES or callable(getattr(globals()[cls], test))
 
 
 @pytest.mark.parametrize("method", KINDS)
@@ -136,42 +108,6 @@ class TestFlows:
         torch.testing.assert_close(vmap(jacrev(psi, 1))(t, Y), J, **CLOSE)
         torch.testing.assert_close(vmap(jacfwd(psi, 1))(t, Y), J, **CLOSE)
 
-    def test_derivatives_in_one_time(self, kind):
-        """A time () beyond Δt, and one that is a whole number of steps."""
-        psi = FLOWS[kind]()
-        for t in (0.7, 2 * psi.dt):
-            time = torch.tensor(t, dtype=torch.float64)
-            slope = jacobian(lambda s: psi(s, Y[0]), time)
-            assert slope.abs().max() > 0
-            torch.testing.assert_close(tangent_along_ones(lambda s: psi(s, Y[0]), time), slope, **CLOSE)
-            torch.testing.assert_close(jacfwd(psi)(time, Y[0]), slope, **CLOSE)
-            torch.testing.assert_close(jacrev(psi)(time, Y[0]), slope, **CLOSE)
-
-    def test_functional_weights(self, kind):
-        """Weights handed in by functional_call are those that run, in `odeint` too, though y0 is a plain tensor."""
-        psi = FLOWS[kind]().requires_grad_(True)
-        weights = dict(psi.named_parameters())
-
-        def end(w):
-            return functional_call(_End(psi), {f"psi.{name}": value for name, value in w.items()}, (Y,)).sum()
-
-        found = grad(end)(weights)
-        expected = torch.autograd.grad(odeint(PENDULUM, Y, T, method=psi)[-1].sum(), list(weights.values()))
-        for name, value in zip(weights, expected, strict=True):
-            torch.testing.assert_close(found[name], value, **CLOSE)
-        ones = {name: torch.ones_like(value) for name, value in weights.items()}
-        along = sum(value.sum() for value in expected)
-        torch.testing.assert_close(jvp(end, (weights,), (ones,))[1], along, rtol=1e-9, atol=1e-12)
-
-
-class _End(torch.nn.Module):
-    def __init__(self, psi):
-        super().__init__()
-        self.psi = psi
-
-    def forward(self, y):
-        return odeint(PENDULUM, y, T, method=self.psi)[-1]
-
 
 class TestNumbersOfH:
     """Tensors within the functions of a system that torch follows, though y0 is a plain tensor."""
@@ -183,51 +119,6 @@ class TestNumbersOfH:
 
     def end(self, k, method="verlet"):
         return odeint(self.system(k), self.y0, T, method=method, options={"dt": 0.1})[-1]
-
-    @pytest.mark.parametrize("method", ["verlet", "gauss_legendre4"])
-    def test_their_derivatives(self, method):
-        k = torch.tensor(1.3, dtype=torch.float64)
-        h = 1e-6
-        slope = (self.end(k + h, method) - self.end(k - h, method)) / (2 * h)
-        assert slope.abs().min() > 0.1
-        for found in (
-            jacobian(lambda k: self.end(k, method), k),
-            tangent_along_ones(lambda k: self.end(k, method), k),
-            jacfwd(lambda k: self.end(k, method))(k),
-            jacrev(lambda k: self.end(k, method))(k),
-        ):
-            torch.testing.assert_close(found, slope, rtol=0, atol=1e-9)
-
-    def test_vmap_over_them(self):
-        k = torch.tensor([0.5, 1.0, 1.5], dtype=torch.float64)
-        torch.testing.assert_close(vmap(self.end)(k), torch.stack([self.end(each) for each in k]), **CLOSE)
-
-    def test_of_dense_output_and_event_times(self):
-        def within(k):
-            return odeint_dense(self.system(k), self.y0, 0.0, 0.7, method="verlet", options={"dt": 0.1})(T[1])
-
-        def crossing(k):
-            return odeint_event(self.system(k), self.y0, T[0], event_fn=lambda t, y: y[0] - 0.3, method="verlet")[0]
-
-        k = torch.tensor(1.3, dtype=torch.float64)
-        for f in (within, crossing):
-            J = jacobian(f, k)
-            assert J.abs().min() > 0.01
-            torch.testing.assert_close(jacfwd(f)(k), J, rtol=0, atol=1e-9)
-            torch.testing.assert_close(jacrev(f)(k), J, rtol=0, atol=1e-9)
-            torch.testing.assert_close(tangent_along_ones(f, k), J, rtol=0, atol=1e-9)
-        with pytest.raises(TypeError, match=r"^`event_fn` is followed by the values.*torch\.func\.vmap"):
-            vmap(crossing)(k[None])
-
-    @pytest.mark.parametrize("derivative", [jacfwd, jacrev, lambda f: partial(tangent_along_ones, f)])
-    def test_derivatives_by_a_mass(self, derivative):
-        def end(mass):
-            system = HamiltonianSystem(lambda q: torch.cos(q).sum(-1), ndof=1, mass=mass)
-            return odeint(system, self.y0, T, method="verlet", options={"dt": 0.1})[-1]
-
-        mass, small = torch.tensor(1.3, dtype=torch.float64), 1e-5
-        differences = (end(mass + small) - end(mass - small)) / (2 * small)
-        torch.testing.assert_close(derivative(end)(mass), differences, rtol=0, atol=1e-8)
 
 
 class TestEvents:
@@ -242,29 +133,6 @@ class TestEvents:
             torch.testing.assert_close(jacrev(part)(Y[0]), J, rtol=0, atol=1e-9)
             torch.testing.assert_close(tangent_along_ones(part, Y[0]), J.sum(-1), rtol=0, atol=1e-9)
 
-    def test_second_derivatives(self):
-        """The derivatives of a derivative: a Newton step with a fixed slope alone would make them wrong."""
-        y = Y[0].clone().requires_grad_(True)
-        assert torch.autograd.gradgradcheck(lambda y: self.event(y)[0], (y,))
-        torch.testing.assert_close(
-            hessian(lambda y: self.event(y)[0])(Y[0]),
-            torch.autograd.functional.hessian(lambda y: self.event(y)[0], Y[0]),
-            rtol=0,
-            atol=1e-9,
-        )
-
-
-def test_the_state_at_a_terminal_event_of_solve_says_that_it_has_no_derivative():
-    def crossing(t, y):
-        return y[0] - 0.9
-
-    crossing.terminal = True
-    with pytest.warns(UserWarning, match="carries no derivative.*odeint_event"):
-        jacfwd(lambda y: solve(PENDULUM, "verlet", (0.0, 5.0), y, events=crossing).y)(Y[0])
-    with pytest.warns(UserWarning, match="carries no derivative.*odeint_event"):
-        solve(PENDULUM, "verlet", (0.0, 5.0), Y[0].clone().requires_grad_(True), events=crossing)
-    assert solve(PENDULUM, "verlet", (0.0, 5.0), Y[0], events=crossing).status == 1
-
 
 @pytest.mark.filterwarnings("ignore::UserWarning")  # Dynamo's own, of code that it traces
 class TestCompiled:
@@ -277,24 +145,6 @@ class TestCompiled:
         expected = integrator.step(PENDULUM, 0.0, Y, 0.1)  # the parts of H are found in the first call
         compiled = torch.compile(lambda y: integrator.step(PENDULUM, 0.0, y, 0.1), backend="eager", fullgraph=True)
         torch.testing.assert_close(compiled(Y), expected, **CLOSE)
-
-    def test_flows(self):
-        torch.compiler.reset()
-        psi = SympFlow(1, hidden=(5,), dt=0.5)
-        expected = psi(1.2, Y)
-        compiled = torch.compile(lambda y: psi(1.2, y), backend="eager", fullgraph=True)
-        torch.testing.assert_close(compiled(Y), expected, **CLOSE)
-        compiled = torch.compile(psi.psi, backend="eager", fullgraph=True)
-        torch.testing.assert_close(compiled(T[1], Y), psi(0.25, Y), **CLOSE)
-
-    def test_gradients_of_a_step(self):
-        torch.compiler.reset()
-        integrator = get("verlet")(dt=0.1)
-        compiled = torch.compile(
-            lambda y: integrator.step(PENDULUM, 0.0, y, 0.1).sum(0), backend="aot_eager", fullgraph=True
-        )
-        J = jacobian(lambda y: integrator.step(PENDULUM, 0.0, y, 0.1).sum(0), Y)
-        torch.testing.assert_close(jacobian(compiled, Y), J, **CLOSE)
 
     @pytest.mark.parametrize("which", [0, 1], ids=["odeint", "solve"])
     def test_whole_runs_are_refused(self, which):
@@ -340,10 +190,6 @@ class TestRefusals:
         with pytest.raises((TypeError, ValueError), match=message):
             vmap(lambda y: solve(PENDULUM, y0=y, **arguments).y)(Y)
 
-    def test_a_metric_under_vmap(self):
-        with pytest.raises(TypeError, match=r"needed as numbers.*torch\.func\.vmap: make this call outside"):
-            vmap(lambda y: torch.as_tensor(solve(PENDULUM, "verlet", (0.0, 0.5), y).energy_error()))(Y)
-
 
 @pytest.mark.parametrize("method", ["rk4", "explicit_adams", "dopri5"])
 def test_methods_of_torchdiffeq(method):
@@ -383,23 +229,9 @@ class TestBatchesUnderVmap:
         assert torch.isfinite(good).all()
         assert seen[1].status == 0
 
-    def test_a_batch_within_a_lane(self):
-        batch = torch.stack([Y, 0.5 * Y])
-        f = problem("gauss_legendre4")[1]
-        torch.testing.assert_close(vmap(f)(batch), torch.stack([f(y) for y in batch]), **CLOSE)
-
     def test_y0_must_be_finite_in_every_lane(self):
         bad = torch.tensor([[1.0, 0.0], [np.nan, 0.0]], dtype=torch.float64)
         with pytest.raises(ValueError, match=r"^`y0` must be finite"):
             vmap(problem("verlet")[1])(bad)
         with pytest.raises(ValueError, match=r"^`y0` must be finite"):
             vmap(problem("verlet")[0])(bad)
-
-
-def test_a_flow_that_ships_is_read_outside_of_a_transform(monkeypatch):
-    """Tables kept from call to call must not be tensors of a transform that has ended."""
-    monkeypatch.setattr("sympflow.integrators.flows._KNOWN", {})
-    monkeypatch.setitem(globals(), "PENDULUM", systems.pendulum())  # of which nothing is kept yet
-    end = problem("sympflow")[1]
-    first = vmap(jacfwd(end))(Y)
-    torch.testing.assert_close(jacobian(end, Y[0]), first[0], **CLOSE)

@@ -1,13 +1,9 @@
 """Our steps of driven systems, H(t, q, p), inside SciPy, torchdiffeq and torchode: they are told the time."""
 
-from importlib import import_module
-
 import numpy as np
 import pytest
 import torch
-import torchdiffeq
 from scipy.integrate import solve_ivp
-from scipy.interpolate import CubicSpline
 
 from sympflow import HamiltonianSystem, SympFlow, solve
 from sympflow.interop import torchdiffeq as ours
@@ -16,10 +12,6 @@ from sympflow.interop.scipy import as_scipy
 TEXT = "p**2/2*(1 + 0.2*sin(t)) - cos(q)*(1 + a*cos(w*t))"
 DRIVEN = HamiltonianSystem.from_sympy(TEXT, time="t", params={"a": 0.3, "w": 1.7}, y0=[1, 0.2], dt=0.1)
 OTHER = HamiltonianSystem.from_sympy(TEXT, time="t", params={"a": 0.3, "w": 1.9}, y0=[1, 0.2], dt=0.1)
-SAMPLED = HamiltonianSystem.from_sympy(
-    "p**2/2 - a*cos(q)", time="t", params={"a": CubicSpline([0, 1, 2, 3], [1, 2, 1, 3])}, y0=[1, 0.2], dt=0.1
-)
-TORCHDIFFEQ = import_module("torchdiffeq._impl.odeint")
 Y = torch.tensor([1.0, 0.2], dtype=torch.float64)
 SPANS = [(1.3, 3.05), (2.0, 0.17)]
 CLOSE = {"rtol": 1e-13, "atol": 1e-13}
@@ -38,23 +30,6 @@ def test_every_peer_makes_the_steps_of_solve(t_span):
     np.testing.assert_allclose(ours.odeint(DRIVEN, Y, times, method=method).T, sol.y, **CLOSE)
     dense = ours.odeint_dense(DRIVEN, Y, times[0], times[-1], method=method)
     np.testing.assert_allclose(dense(torch.tensor(between)).T, sol.sol(between), **CLOSE)
-
-
-def test_torchode_has_a_time_for_each_sample():
-    torchode = pytest.importorskip("torchode", reason="torchode is an optional peer: pip install torchode")
-    from sympflow.interop.torchode import register
-
-    register("driven_verlet", DRIVEN, "verlet")
-    t = torch.tensor([[0.0, 0.55, 2.0], [1.0, 1.3, 3.21]], dtype=torch.float64)
-    arguments = {"method": "driven_verlet", "controller": torchode.FixedStepController()}
-    dt0 = torch.full((2,), 0.1, dtype=torch.float64)
-    found = torchode.solve_ivp(DRIVEN, Y.expand(2, 2), t, dt0=dt0, **arguments).ys
-    for states, times in zip(found, t.numpy(), strict=True):
-        sol = solve(DRIVEN, "verlet", (times[0], times[-1]), t_eval=times)
-        np.testing.assert_allclose(states.T, sol.y, **CLOSE)
-    register("sampled_verlet", SAMPLED, "verlet")
-    with pytest.raises(ValueError, match="leaves the samples"):
-        torchode.solve_ivp(SAMPLED, Y[None], t[1:], dt0=dt0[1:], **{**arguments, "method": "sampled_verlet"})
 
 
 def test_events_are_found_at_the_time():
@@ -85,34 +60,6 @@ def test_gradients_reach_all_times_the_first_too(odeint, method):
         step = 1e-5 * np.eye(3)[i]
         central = (total(t.detach().numpy() + step, method) - total(t.detach().numpy() - step, method)) / 2e-5
         assert float(t.grad[i]) == pytest.approx(central, rel=1e-8)
-
-
-def test_transforms_follow_the_start():
-    def end(t0, y):
-        return ours.odeint(DRIVEN, y, torch.stack([t0, t0 + 0.73]), method="verlet")[-1]
-
-    starts = torch.tensor([0.3, 1.1], dtype=torch.float64)
-    together = torch.func.vmap(end, (0, None))(starts, Y)
-    tangent = torch.func.jvp(lambda t: end(t, Y), (starts[0],), (torch.ones_like(starts[0]),))[1]
-    np.testing.assert_allclose(together, torch.stack([end(t, Y) for t in starts]), **CLOSE)
-    np.testing.assert_allclose(tangent, (end(starts[0] + 1e-5, Y) - end(starts[0] - 1e-5, Y)) / 2e-5, rtol=1e-8)
-
-
-def test_torchdiffeqs_own_table_and_its_callback_have_the_time(monkeypatch):
-    monkeypatch.setattr(TORCHDIFFEQ, "SOLVERS", dict(TORCHDIFFEQ.SOLVERS))
-    ours.register("verlet")
-    for t in (torch.tensor([0.3, 1.04], dtype=torch.float64), torch.tensor([1.3, 0.41], dtype=torch.float64)):
-        expected = ours.odeint(DRIVEN, Y, t, method="verlet")
-        torch.testing.assert_close(torchdiffeq.odeint(DRIVEN, Y, t, method="verlet"), expected, rtol=0, atol=1e-13)
-    seen = []
-
-    def announcing(t, y):
-        return DRIVEN(t, y)
-
-    announcing.callback_step = lambda t, y, h: seen.append(float(t))
-    found = ours.odeint(announcing, Y, t, method="verlet", options={"system": DRIVEN})
-    torch.testing.assert_close(found, expected, rtol=0, atol=1e-13)
-    np.testing.assert_allclose(seen, 1.3 - 0.1 * np.arange(9))
 
 
 def as_function(system):
@@ -147,18 +94,3 @@ def test_another_drive_is_refused_whoever_asks():
     t = torch.tensor([0.0, 3.0], dtype=torch.float64)
     with pytest.raises(ValueError, match="`func` is not the system that method 'verlet' solves"):
         ours.odeint(as_function(OTHER), Y, t, method="verlet", options={"system": DRIVEN})
-
-
-def test_no_peer_leaves_the_samples_of_a_drive():
-    Verlet = as_scipy("verlet", SAMPLED)
-    with pytest.raises(ValueError, match="leaves the samples"):
-        solve_ivp(SAMPLED, (0, 4), [1, 0.2], method=Verlet)
-    unbounded = solve_ivp(SAMPLED, (0, np.inf), [1, 0.2], method=Verlet)
-    assert "leaves the samples" in unbounded.message
-    np.testing.assert_allclose(unbounded.t[-1], 3)
-    t = torch.tensor([0.0, 4.0], dtype=torch.float64)
-    for ask in (ours.odeint, ours.odeint_adjoint):
-        with pytest.raises(ValueError, match="leaves the samples"):
-            ask(SAMPLED, Y, t, method="verlet")
-    with pytest.raises(ValueError, match="leaves the samples"):
-        ours.odeint_event(SAMPLED, Y, t[0], event_fn=lambda t, y: 9.0 - t, method="verlet")

@@ -1,14 +1,16 @@
 """Our methods inside `solve_ivp`: the same numbers as `solve`, and all that SciPy's driver asks of a solver."""
 
+import copy
 import math
+import pickle
 
 import numpy as np
 import pytest
 import torch
-from conftest import KINDS
+from conftest import KINDS, refusals
 from scipy.integrate import solve_ivp
 
-from sympflow import HamiltonianSystem, SympFlow, available, get, shipped_flows, solve, systems
+from sympflow import HamiltonianSystem, SympFlow, available, get, solve, systems
 from sympflow.arrays import stack
 from sympflow.integrators.base import FixedStep
 from sympflow.interop.scipy import as_scipy
@@ -76,16 +78,6 @@ class TestEveryKind:
                 np.testing.assert_allclose(theirs.t_events[i], ours.t_events[i], rtol=1e-10)
                 np.testing.assert_allclose(theirs.y_events[i], ours.y_events[i], atol=1e-9)
 
-    def test_max_step_samples_the_same_run(self, method):
-        coarse = solve_ivp(HH, (0, 3), HH.y0, method=solver(method))
-        fine = solve_ivp(HH, (0, 3), HH.y0, method=solver(method), max_step=0.04, dense_output=True)
-        n = round((len(fine.t) - 1) / (len(coarse.t) - 1))
-        assert n == np.ceil(np.diff(coarse.t)[0] / 0.04 - 1e-9)
-        np.testing.assert_allclose(fine.y[:, ::n], coarse.y, atol=200 * EPS)
-        np.testing.assert_allclose(fine.sol(fine.t), fine.y, atol=200 * EPS)
-        none = solve_ivp(HH, (2, 2), HH.y0, method=solver(method), dense_output=True)
-        np.testing.assert_array_equal([none.y[:, -1], none.sol(2.0)], [HH.y0, HH.y0])
-
 
 @pytest.fixture
 def counting():
@@ -133,26 +125,6 @@ def test_every_evaluation_of_a_force_is_counted(method, arguments, counting):
     assert len(of_fun) < 20
 
 
-def test_a_flow_of_networks_evaluates_no_force():
-    arguments = {"method": as_scipy("sympflow", HH, flow="henon_heiles-sympflow"), "events": lambda t, y: y[0]}
-    assert solve_ivp(HH, (0, 50), HH.y0, **arguments).nfev == 1
-
-
-def test_a_primed_flow_counts_its_forces():
-    """The forces of the steps, each of which SciPy reports, and of the one velocity that is compared with `fun`."""
-    flow = get("sympflow")().flow_for(HH)
-    alone = flow.evaluations(0, 0, 1, "array")["force_evaluations"]
-    least = flow.evaluations(35, 35, 0, "compiled")["force_evaluations"]  # T = 49 is 35 steps of Δt = 1.4
-    nfev = solve_ivp(HH, (0, 49), HH.y0, method=as_scipy("sympflow", HH), t_eval=[49.0]).nfev
-    assert least <= nfev - alone - 1 <= least + 6 * alone  # computed in up to six pieces, each with a start of its own
-
-
-def test_two_events_within_a_step_are_seen_with_max_step(rotation):
-    arguments = {"events": lambda t, y: (t - 0.2) * (t - 0.8), "method": as_scipy(rotation)}
-    assert solve_ivp(OSCILLATOR, (0, 2), [1.0, 0.0], **arguments).t_events[0].size == 0
-    assert solve_ivp(OSCILLATOR, (0, 2), [1.0, 0.0], max_step=0.3, **arguments).t_events[0].size == 2
-
-
 def test_a_blow_up_ends_with_status_minus_one():
     sol = solve_ivp(HH, (0, 20), BLOW_UP, method=as_scipy("verlet", HH, dt=0.01))
     assert (sol.status, sol.success) == (-1, False)
@@ -160,34 +132,8 @@ def test_a_blow_up_ends_with_status_minus_one():
     assert np.isfinite(sol.y).all()
 
 
-def pendulum(t, y):
-    return [y[1], -np.sin(y[0])]
-
-
 class TestAnotherSystem:
     """A right-hand side that is not what the method solves is refused, wherever it differs: here 1e-6 and more."""
-
-    @pytest.mark.parametrize("y0", [[0.0, 1.9], [1.0, 0.5], [0.0, 0.0], [1e-3, 0.0]])
-    @pytest.mark.parametrize("fun", [PENDULUM, pendulum])
-    def test_that_agrees_at_the_start(self, fun, y0):
-        """The oscillator has the velocity of the pendulum where q = 0."""
-        with pytest.raises(ValueError, match=r"^`fun` is not the system that method 'kahan_li8' solves.*as_scipy"):
-            solve_ivp(fun, (0, 5), y0, method=as_scipy("kahan_li8", OSCILLATOR))
-
-    def test_that_is_right(self):
-        for fun in (PENDULUM, systems.pendulum(), pendulum, lambda t, y: np.array(pendulum(t, y), dtype=np.float32)):
-            sol = solve_ivp(fun, (0, 5), [0.0, 1.9], method=as_scipy("kahan_li8", PENDULUM))
-            assert sol.y[:, -1] == pytest.approx([0.340, -1.870], abs=1e-3)
-
-    @pytest.mark.parametrize("strength", [lambda t: 0.01 * t, np.sin, lambda t: 31 < t < 36, lambda t: t > 99.6])
-    def test_that_depends_on_the_time(self, strength):
-        """It agrees at t0: what changes later, for a while or at the end, is seen."""
-
-        def fun(t, y):
-            return [y[1], -np.sin(y[0]) * (1 + strength(t))]
-
-        with pytest.raises(ValueError, match=r"^`fun` depends on the time: .* method 'verlet' solves an autonomous"):
-            solve_ivp(fun, (0, 100), [0.0, 1.9], method=as_scipy("verlet", PENDULUM))
 
     @pytest.mark.parametrize("turn", [1.2, 2.2, 2.45])
     def test_that_differs_only_where_the_run_comes_to(self, turn):
@@ -199,33 +145,6 @@ class TestAnotherSystem:
         with pytest.raises(ValueError, match=r"^`fun` is not the system that method 'verlet' solves: at t = \d"):
             solve_ivp(fun, (0, 60), [0.0, 1.9], method=as_scipy("verlet", PENDULUM))
 
-    def test_that_has_another_number_of_variables_to_compare(self):
-        with pytest.raises(ValueError, match=r"^`fun` is not the system that method 'verlet' solves: their Hamilt"):
-            solve_ivp(HH, (0, 1), HH.y0[:2], method=as_scipy("verlet", PENDULUM))
-
-    def test_of_functions_that_fail_elsewhere(self):
-        """Only where the run is must a function have a value."""
-
-        def fun(t, y):
-            if abs(y[0] - 1.0) > 1e-3:
-                raise ArithmeticError
-            return pendulum(t, y)
-
-        assert solve_ivp(fun, (0, 0.01), [1.0, 0.0], method=as_scipy("verlet", PENDULUM)).success
-
-    def test_of_a_flow(self, rotation):
-        """A bare flow, a network that knows its own error, and a primed flow, which knows its system."""
-        with pytest.raises(ValueError, match=r"^`fun` is not the system that method 'sympflow' solves"):
-            solve_ivp(systems.harmonic_oscillator(3.0), (0, 1), [1.0, 0.5], method=as_scipy(rotation))
-        solve_ivp(lambda t, y: [y[1], -y[0]], (0, 1), [1.0, 0.5], method=as_scipy(rotation))
-        for name in ("pendulum-sympflow", "pendulum-primed-3-1"):
-            (shipped,) = (f for f in shipped_flows(PENDULUM) if f.name == name)
-            flow = as_scipy(shipped.load(PENDULUM))
-            assert solve_ivp(pendulum, (0, 20), [0.0, 0.9], method=flow).success
-            for other in (lambda t, y: [y[1], -y[0]], lambda t, y: [y[1], -np.sin(y[0]) * (1 + 0.01 * t)]):
-                with pytest.raises(ValueError, match=r"^`fun` (is not the system|depends on the time)"):
-                    solve_ivp(other, (0, 20), [0.0, 0.9], method=flow)
-
 
 def test_a_flow_and_a_name_without_system():
     by_flow = solve_ivp(HH, (0, 5), HH.y0, method=as_scipy(get("sympflow")().flow_for(HH)))
@@ -235,20 +154,6 @@ def test_a_flow_and_a_name_without_system():
 
 
 class TestBadInput:
-    def test_at_the_door(self):
-        with pytest.raises(TypeError, match=r"^`method` 'rk45' is not a fixed-step map"):
-            as_scipy("rk45", HH)
-        with pytest.raises(ValueError, match=r"^`method` 'nothing' is unknown"):
-            as_scipy("nothing", HH)
-        with pytest.raises(TypeError, match=r"^`system` must be a HamiltonianSystem; got function"):
-            as_scipy("verlet", lambda t, y: y)
-        with pytest.raises(TypeError, match=r"^`rtol` is not an option"):
-            as_scipy("verlet", HH, rtol=1e-3)
-        with pytest.raises(ValueError, match=r"^`system` .* degrees of freedom"):
-            as_scipy(SympFlow(1), HH)
-        with pytest.raises(ValueError, match="no shipped sympflow flow"):
-            as_scipy("sympflow", systems.harmonic_oscillator(3.7))
-
     @pytest.mark.parametrize(
         ("fun", "y0", "error", "message"),
         [
@@ -263,33 +168,63 @@ class TestBadInput:
         with pytest.raises(error, match=message):
             solve_ivp(fun, (0, 1), y0, method=as_scipy("verlet", HH))
 
-    def test_of_methods_that_are_no_class(self):
-        for method in ("sympflow", SympFlow(2), as_scipy("verlet", HH)(HH, 0.0, HH.y0, 1.0)):
-            with pytest.raises(ValueError, match=r"^`method` must be one of .* or OdeSolver class"):
-                solve_ivp(HH, (0, 1), HH.y0, method=method)
-
-    def test_of_methods_that_it_cannot_drive(self):
-        with pytest.raises(TypeError, match=r"^`method` 'log_leapfrog' takes steps that are not equal in t"):
-            as_scipy("log_leapfrog", systems.kepler())
-        with pytest.raises(ValueError, match=r"^`y` must have shape \(\.\.\., 4\).*leave `vectorized` out"):
-            solve_ivp(HH, (0, 1), HH.y0, vectorized=True)
-
     def test_of_options_and_times(self):
         verlet = as_scipy("verlet", HH)
         with pytest.warns(UserWarning, match="atol, rtol have no effect"):
             solve_ivp(HH, (0, 1), HH.y0, method=verlet, rtol=1e-3, atol=1e-6)
         with pytest.warns(UserWarning, match=r"dt have no effect .*; dt is an option of as_scipy"):
             solve_ivp(HH, (0, 1), HH.y0, method=verlet, dt=0.1)
-        with pytest.raises(ValueError, match=r"^`max_step` must be positive; got 'a'"):
-            solve_ivp(HH, (0, 1), HH.y0, method=verlet, max_step="a")
-        with pytest.raises(ValueError, match=r"^`max_step` must be positive"):
-            solve_ivp(HH, (0, 1), HH.y0, method=verlet, max_step=-1)
-        with pytest.raises(TypeError, match=r"^`system` is needed for method 'verlet'"):
-            solve_ivp(lambda t, y: y, (0, 1), HH.y0, method=as_scipy("verlet"))
 
-    def test_of_a_flow_without_an_inverse_and_of_single_precision(self):
-        with pytest.raises((TypeError, ValueError), match=r"inverse|negative"):
-            solve_ivp(HH, (1, 0), HH.y0, method=as_scipy("mlp", HH))
-        flow = SympFlow.primed(PENDULUM).to(torch.float32)
-        with pytest.raises(TypeError, match=r"^`y0` is torch.float64, but .*float32"):
-            solve_ivp(PENDULUM, (0, 1), [1.0, 0.0], method=as_scipy(flow))
+
+def driven(method, fun=HH, span=(0, 1), y0=HH.y0, **options):
+    return lambda: solve_ivp(fun, span, y0, method=method() if callable(method) else method, **options)
+
+
+test_refusals = refusals(
+    (lambda: as_scipy("rk45", HH), TypeError, "^`method` 'rk45' is not a fixed-step map"),
+    (lambda: as_scipy("nothing", HH), "^`method` 'nothing' is unknown"),
+    (lambda: as_scipy("verlet", lambda t, y: y), TypeError, "^`system` must be a HamiltonianSystem; got function"),
+    (lambda: as_scipy("verlet", HH, rtol=1e-3), TypeError, "^`rtol` is not an option"),
+    (lambda: as_scipy(SympFlow(1), HH), "^`system` .* degrees of freedom"),
+    (lambda: as_scipy("sympflow", systems.harmonic_oscillator(3.7)), "no shipped sympflow flow"),
+    (lambda: as_scipy("log_leapfrog", systems.kepler()), TypeError, "^`method` .* takes steps that are not equal in t"),
+    (driven("sympflow"), "^`method` must be one of .* or OdeSolver class"),
+    (driven(lambda: SympFlow(2)), "^`method` must be one of .* or OdeSolver class"),
+    (driven(lambda: as_scipy("verlet", HH), max_step="a"), "^`max_step` must be positive; got 'a'"),
+    (driven(lambda: as_scipy("verlet", HH), max_step=-1), "^`max_step` must be positive"),
+    (driven(lambda: as_scipy("verlet"), lambda t, y: y), TypeError, "^`system` is needed for method 'verlet'"),
+    (driven(lambda: as_scipy("mlp", HH), span=(1, 0)), (TypeError, ValueError), "inverse|negative"),
+    (driven(lambda: as_scipy("verlet", PENDULUM), y0=HH.y0[:2]), "is not the system .*: their Hamilt"),
+    (
+        driven(lambda: as_scipy(SympFlow.primed(PENDULUM).to(torch.float32)), PENDULUM, y0=[1.0, 0.0]),
+        TypeError,
+        "^`y0` is torch.float64, but .*float32",
+    ),
+    (lambda: solve_ivp(HH, (0, 1), HH.y0, vectorized=True), "^`y` must have shape .*leave `vectorized` out"),
+)
+
+
+def test_an_infinite_end_without_an_event_says_so(monkeypatch):
+    monkeypatch.setattr("sympflow.interop.scipy.open_end", lambda t0, t1, dt: t0 + np.copysign(1000 * dt, t1))
+    verlet = as_scipy("verlet", OSCILLATOR, dt=0.005)
+    for end, t in ((np.inf, 5.0), (-np.inf, -5.0)):
+        result = solve_ivp(OSCILLATOR, (0.0, end), [1.0, 0.0], method=verlet)
+        assert (result.status, result.t[-1]) == (-1, pytest.approx(t, abs=1e-12))
+        assert result.message.startswith("No terminal event ended the run within 1,000 steps, up to t = ")
+    for span in ((0.0, np.nan), (-np.inf, np.inf), (np.nan, 1.0)):
+        with pytest.raises(ValueError, match=r"^`t_span` must start at a finite time"):
+            solve_ivp(OSCILLATOR, span, [1.0, 0.0], method=verlet)
+
+
+def test_solutions_and_solvers_are_pickled_and_copied():
+    method = as_scipy("kahan_li8", OSCILLATOR, dt=0.3)
+    result = solve_ivp(OSCILLATOR, (0, 1), [1.0, 0.0], method=method, dense_output=True)
+    for again in (pickle.loads(pickle.dumps(result.sol)), copy.deepcopy(result.sol)):
+        np.testing.assert_array_equal(again(0.4321), result.sol(0.4321))
+    solver = method(OSCILLATOR, 0.0, [1.0, 0.0], 3.0)
+    solver.step()
+    twin = copy.deepcopy(solver)
+    for each in (solver, twin, twin):
+        each.step()
+    np.testing.assert_allclose(solver.y, [np.cos(0.6), -np.sin(0.6)], atol=1e-8)
+    np.testing.assert_allclose(twin.y, [np.cos(0.9), -np.sin(0.9)], atol=1e-8)

@@ -64,16 +64,6 @@ def test_threads_that_compile_at_once(method, tmp_path):
     assert not [*tmp_path.rglob("*.part")]
 
 
-@pytest.mark.slow
-def test_processes_that_compile_at_once(tmp_path):
-    """Each finds or makes the same file, and none reads what another one is about to write."""
-    processes = [started(tmp_path, SCRIPT) for _ in range(4)]
-    first, *others = [process.communicate()[0] for process in processes]
-    assert first.startswith("[[")
-    assert others == [first] * 3
-    assert [file.suffix for file in (tmp_path / "code").iterdir()] == [".o"]
-
-
 def test_a_fresh_process_finds_the_machine_code_and_makes_what_is_damaged_again(tmp_path):
     first = told(tmp_path, SCRIPT)
     (file,) = (tmp_path / "code").iterdir()

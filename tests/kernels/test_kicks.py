@@ -2,13 +2,9 @@
 
 import numpy as np
 import pytest
-import sympy as sp
-import torch
-from numba import njit
 
-from sympflow import Box, SympFlow, systems
+from sympflow import SympFlow, systems
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.kernels.approximations import on_interval, position_ranges
 from sympflow.kernels.splitting_loops import splitting_loops
 from sympflow.kernels.stages import StageTable
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT
@@ -76,25 +72,6 @@ def test_kicks_in_a_range_of_positions_are_the_same_but_for_rounding(H, low, hig
     check(HamiltonianSystem.from_sympy(H), level, rng.permutation(q)[:, None], ((low, high),))
 
 
-def test_kinks_and_polynomials_have_no_ranges():
-    for V in ("Abs(q)", "q**4"):
-        system = HamiltonianSystem.from_sympy(f"p**2/2 + {V}", domain=Box([-1, -1], [1, 1]))
-        assert position_ranges(system.symbols, system.domain) == ()
-
-
-def test_functions_are_polynomials_where_few_powers_are_exact():
-    x = sp.Symbol("x", real=True)
-    sine = on_interval([sp.sin(x)], x, -2.5, 2.4)
-    assert sine is not None
-    assert (sine.low, sine.high, sine.center) == (-2.5, 2.5, 0.0)
-    assert not sine.coefficients[0, ::2].any()  # odd
-    at = np.linspace(-2.5, 2.5, 201)
-    np.testing.assert_allclose(np.polyval(sine.coefficients[0, ::-1], at), np.sin(at), rtol=0, atol=2e-15)
-    assert on_interval([sp.sin(40 * x)], x, -1.0, 1.0) is None  # too long
-    assert on_interval([1 / x**2], x, 0.01, 1.0) is None
-    assert on_interval([sp.log(x)], x, -1.0, 2.0) is None  # not defined everywhere
-
-
 @pytest.mark.parametrize("name", SCENES)
 def test_the_curvature_is_that_of_v_along_the_acceleration(name):
     """½ v·∇²V v, v = M⁻¹∇V, and its gradient by differences of it."""
@@ -127,35 +104,3 @@ def test_the_flow_steps_every_row_by_its_own_time():
     assert np.abs(kernel.step(-h, together).states - y).max() < 1e-13
     with pytest.raises(ValueError, match="`t` must lie in"):
         kernel.step(np.linspace(0.1, 0.7, 40), y)
-
-
-@njit
-def slope_by_numba(q, out):
-    out[0], out[1] = q[0] ** 3 + q[1] ** 2, q[1] ** 3 + 2 * q[0] * q[1]
-
-
-@njit
-def product_by_numba(q, v, out):
-    out[0] = 3 * q[0] ** 2 * v[0] + 2 * q[1] * v[1]
-    out[1] = 2 * q[1] * v[0] + (3 * q[1] ** 2 + 2 * q[0]) * v[1]
-
-
-POTENTIAL = njit(lambda q: (q[0] ** 4 + q[1] ** 4) / 4 + q[0] * q[1] ** 2)
-BY_NUMBA = {"potential": POTENTIAL, "gradient": slope_by_numba, "hessian_vector": product_by_numba}
-
-
-@pytest.mark.parametrize(
-    ("functions", "accuracy"),
-    [({"potential": lambda q: (q**4).sum(-1) / 4 + q[..., 0] * q[..., 1] ** 2}, 1e-13), (BY_NUMBA, 1e-9)],
-    ids=["by automatic differentiation", "by differences of Numba functions"],
-)
-def test_the_curvature_without_symbols(functions, accuracy):
-    system = HamiltonianSystem(ndof=2, **functions)
-    symbolic = HamiltonianSystem.from_sympy("p1**2/2 + p2**2/2 + (q1**4 + q2**4)/4 + q1*q2**2")
-    q = np.random.default_rng(2).normal(size=(5, 2))
-    expected = symbolic.curvature_gradient(q)
-    for x in (q, torch.as_tensor(q)):
-        np.testing.assert_allclose(np.asarray(system.curvature(x)), symbolic.curvature(q), rtol=1e-12)
-        slope = torch.as_tensor(system.curvature_gradient(x)).detach()
-        np.testing.assert_allclose(slope, expected, rtol=accuracy, atol=accuracy * np.abs(expected).max())
-    assert system.curvature_gradient(q[:0]).shape == (0, 2)

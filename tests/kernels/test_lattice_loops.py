@@ -5,11 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sympflow import HamiltonianSystem, SympFlow, solve
+from sympflow import HamiltonianSystem, solve
 from sympflow.kernels import lattices
-from sympflow.kernels.protocol import RunCheckpoint
 from sympflow.kernels.splitting_loops import splitting_loops
-from sympflow.kernels.stages import single_table
 from sympflow.kernels.threads import at_most
 from sympflow.schemes import SCHEMES
 
@@ -111,14 +109,6 @@ def test_lattices_in_vector_registers(shapes, boundary, method):
         assert_loops_are_arrays(system, method, start(system))
 
 
-def test_a_bond_that_is_not_there_may_be_infinite():
-    """Along the axis of three sites the middle one has no bond of length 2, and zeros beyond the ends are far away."""
-    system = HamiltonianSystem.lattice(bond={1: "r**2/2", 2: "exp(r) - r"}, shape=(3, 9), boundary="free")
-    y0 = start(system)
-    y0[: system.ndof] += 800
-    assert_loops_are_arrays(system, "verlet", y0)
-
-
 @pytest.fixture
 def pieces(monkeypatch):
     """Lattices that threads share however small they are."""
@@ -150,42 +140,6 @@ def test_pieces_and_threads_change_nothing(method, shape, boundary, pieces):
         np.testing.assert_array_equal(other, runs[0])
 
 
-def test_widths_change_nothing(monkeypatch):
-    system, runs = chain(48), []
-    for width in (1, 2, 4, 8):
-        monkeypatch.setattr(lattices, "arrangement", lambda lattice, width=width: ([0], width))
-        code = lattices.LatticeCode(system.local, False, SCHEMES["chin4c"].level, False)
-        runs.append(np.empty((1, 96)))
-        code.mapped(single_table(SCHEMES["chin4c"], 0.1).packed, start(system, 1), runs[-1])
-        np.testing.assert_array_equal(runs[-1], runs[0])
-
-
-@pytest.mark.parametrize("threads", [1, 2])
-def test_a_run_that_becomes_infinite_keeps_what_it_has(threads, pieces):
-    system = ring(230)
-    y0 = start(system)
-    y0[7] = 60.0
-    with at_most(threads):
-        loops, arrays = (
-            solve(system, "srkn6b", t_span=(0.0, 10.0), y0=y0, dt=0.2, backend=backend)
-            for backend in ("compiled", "array")
-        )
-    assert loops.status == arrays.status == -1
-    np.testing.assert_array_equal(loops.t, arrays.t)
-
-
-@pytest.mark.parametrize("compensated", [False, True])
-def test_a_run_in_pieces_has_the_bits_of_one(compensated, pieces):
-    system = ring(230)
-    y0, kernel = start(system), splitting_loops(system).kernel(SCHEMES["srkn6b"], compensated)
-    for threads in (1, 2):
-        with at_most(threads):
-            whole = kernel.run(0.05, y0, 90, np.array([20, 90])).states
-            carry = RunCheckpoint()
-            parts = [kernel.run(0.05, y0, n, np.array([n]), carry).states[0] for n in (20, 90)]
-        np.testing.assert_array_equal(np.stack(parts), whole)
-
-
 @pytest.mark.parametrize("shape", [48, (6, 9)])
 def test_compensated_sums_lower_the_rounding(shape):
     """There and back by a symmetric scheme: what is left is rounding, whatever the error of the method."""
@@ -197,28 +151,3 @@ def test_compensated_sums_lower_the_rounding(shape):
         back = solve(system, "srkn6b", t_span=(100.0, 0), y0=end, t_eval=[0.0], **how).y[:, -1]
         left.append(np.abs(back - y0).max())
     assert left[1] < left[0] / 5
-
-
-def test_the_code_does_not_depend_on_the_size():
-    few, many = (splitting_loops(ring(n)).functions(0, False) for n in (64, 6400))
-    assert few.function("run", 1) is many.function("run", 1)
-
-
-def test_what_has_no_loops_runs_on_arrays():
-    rates = np.linspace(0.1, 0.2, 48)
-    sol = solve(ring(damping=rates), "verlet", t_span=(0, 0.5), y0=start(ring()), dt=0.05)
-    assert sol.stats["backend"] == "numpy"
-
-
-def test_a_primed_flow_of_a_piece_serves_the_large_lattice():
-    """A periodic state of a ring, repeated, moves on the larger ring as it does on the small one."""
-    piece, large = ring(6), ring(12)
-    flow = SympFlow.primed(piece, stages=3, dt=0.2)
-    carried = flow.transferred(large)
-    y0 = start(piece)
-    options = {"t_span": (0.0, 2.0), "t_eval": [2.0], "backend": "array"}
-    small = solve(piece, flow, y0=y0, **options).y[:, 0].reshape(2, 6)
-    repeated = solve(large, carried, y0=np.tile(y0.reshape(2, 6), 2).ravel(), **options).y[:, 0].reshape(2, 12)
-    np.testing.assert_allclose(repeated, np.tile(small, 2), rtol=0, atol=1e-13)
-    with pytest.raises(ValueError, match=r"its bond is .*r\*\*4/5"):
-        flow.transferred(HamiltonianSystem.lattice(bond="r**2/2 + r**4/5", shape=12))

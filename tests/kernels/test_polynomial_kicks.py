@@ -2,82 +2,19 @@
 
 import numpy as np
 import pytest
-import sympy as sp
 import torch
 
-import sympflow
-from sympflow import HamiltonianSystem, SympFlow, systems, train
-from sympflow.hamiltonian.monomials import gradient, in_monomials, monomials, value
+from sympflow import systems
+from sympflow.hamiltonian.monomials import gradient, value
 from sympflow.integrators.splitting import Splitting
 from sympflow.kernels.splitting_loops import splitting_loops
 from sympflow.schemes import Scheme
-from sympflow.training.fits import PrimedFit
 
 pytestmark = pytest.mark.slow
 
 EPS = np.finfo(float).eps
 HH, QUARTIC = systems.henon_heiles(), systems.quartic()
 MONOMIALS = ((2, 0), (1, 1), (0, 3), (2, 3))
-
-
-@pytest.mark.parametrize(
-    ("H", "degree", "expected"),
-    [
-        # as even as a potential that is no polynomial
-        ("cos(q1) + q2", 2, {(0, 1), (0, 2), (2, 0)}),
-        ("cos(q1)*cos(q2)", 3, {(0, 2), (2, 0)}),
-        # those that commutators make
-        ("q1**4 + q2**4 + q1**2", 6, {(2, 0), (4, 0), (0, 4), (6, 0), (0, 6)}),  # the coordinates do not mix
-        ("q1**2*q2 - q2**3", 3, {(0, 3), (2, 1)}),
-        ("q1**2*q2 - q2**3", 4, {(0, 3), (2, 1), (0, 4), (2, 2), (4, 0)}),
-        ("q1**4 + q1*q2**3", 4, {(4, 0), (1, 3)}),
-        ("3*q1 + q2**2", 4, {(1, 0), (0, 2)}),  # a constant, the product of the gradients of q1, is no monomial
-        # ∇fᵀM⁻¹∇g of q1² and q2² is 4 (M⁻¹)₁₂ q1 q2
-        ("q1**2 + 2*q2**2", 2, {(2, 0), (0, 2)}),
-        ("p1**2 + p2**2 + p1*p2/3 + q1**2 + 2*q2**2", 2, {(2, 0), (0, 2), (1, 1)}),
-    ],
-)
-def test_monomials_are_those_that_are_needed(H, degree, expected):
-    whole = HamiltonianSystem.from_sympy(H) if "p1" in H else HamiltonianSystem.from_sympy(f"(p1**2 + p2**2)/2 + {H}")
-    assert set(monomials(whole.symbols, degree)) == expected
-
-
-@pytest.mark.parametrize("system", [HH, QUARTIC], ids=["henon_heiles", "quartic"])
-def test_monomials_hold_what_the_formula_of_baker_campbell_and_hausdorff_has(system):
-    """The force gradient, the curvature, and the next products of gradients."""
-    symbols = system.symbols
-    q, V = symbols.q, symbols.V
-
-    def product(f, g):
-        return sp.expand(sum(sp.diff(f, x) * sp.diff(g, x) for x in q))
-
-    second = product(V, V)
-    third = product(V, second)
-    for f in (V, second, third, product(second, second), product(V, third)):
-        degree = sp.Poly(f, *q).total_degree()
-        assert in_monomials(f, symbols, monomials(symbols, degree)) is not None
-
-
-@pytest.mark.parametrize(
-    ("system", "message"),
-    [
-        (QUARTIC, "`polynomial` 1 leaves no monomial that suits V: take a higher degree"),
-        (HamiltonianSystem(lambda q: (q**2).sum(-1) / 2, ndof=1), r"^`polynomial` is for symbolic systems"),
-    ],
-)
-def test_systems_without_monomials_are_refused(system, message):
-    with pytest.raises(ValueError, match=message):
-        SympFlow.primed(system, 2, polynomial=1)
-
-
-def test_the_force_gradient_of_a_polynomial_is_one():
-    q = np.random.default_rng(0).normal(size=(5, 2))
-    symbols, of_kicks = QUARTIC.symbols, monomials(QUARTIC.symbols, 6)
-    e = in_monomials(symbols.force_gradient, symbols, of_kicks)
-    expected = -(QUARTIC.force(q) ** 2).sum(-1) / 2
-    np.testing.assert_allclose(value(of_kicks, e, q), expected, rtol=64 * EPS)
-    assert in_monomials(symbols.force_gradient, symbols, monomials(symbols, 4)) is None
-    assert in_monomials(sp.cos(symbols.q[0]), symbols, of_kicks) is None
 
 
 @pytest.mark.parametrize("each", [False, True], ids=["one polynomial", "one for each state"])
@@ -136,17 +73,3 @@ def test_compiled_runs_are_the_steps_of_arrays(last, compensated):
 def test_tables_that_do_not_fit_are_refused(changes, message):
     with pytest.raises(ValueError, match=message):
         Scheme(**(vars(scheme()) | changes))
-
-
-def test_a_rung_takes_over_the_force_gradients():
-    """The search begins at the table without a polynomial, where one holds ½|∇V|², and comes nearer than that."""
-    options = {"restarts": 1, "points": 60, "label_times": 2, "reference_states": 50}
-    before = train(QUARTIC, flow=SympFlow.primed(QUARTIC, 3, dt=0.5, processor=2), **{**options, "restarts": 3})
-    start, after = PrimedFit(0.5, stages=3, processor=2, polynomial=6).flow(QUARTIC, earlier=before), {}
-    flow = train(QUARTIC, flow=start, steps=1, callback=lambda n, figures: after.update(figures), **options)
-    assert flow.monomials == monomials(QUARTIC.symbols, 6)
-    assert after["one_step_error"] < before.figures["one_step_error"]
-    assert flow.kernel_scheme().symmetric
-    sol = sympflow.solve(QUARTIC, flow, (0.0, 3.3), QUARTIC.domain.sample(4, 1))
-    assert sol.stats["backend"] == "compiled"
-    assert sympflow.symplecticity_defect(sol).max() < 1e-12

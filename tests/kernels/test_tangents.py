@@ -68,17 +68,6 @@ def test_friction_shrinks_vectors(damping, room, monkeypatch):
     assert np.abs(out[:, 4:].reshape(-1, 4, 4).swapaxes(1, 2) - A).max() < 1e-14
 
 
-@pytest.mark.parametrize("t", [-1.0, 0.7])
-def test_steps_of_a_flow_that_ships_are_differentiated_without_tensors(t, monkeypatch):
-    system, integrator = systems.henon_heiles(), build("sympflow", {})
-    y = system.y0 + 0.05 * np.random.default_rng(0).standard_normal((5, 4))
-    h = np.full(5, t)
-    expected = forward_tangent(lambda x, s: integrator.step(system, 0.0, x, s), y, h)
-    monkeypatch.setattr("sympflow.integrators.contract.jacobian", None)
-    for a, b in zip(integrator.tangent(system, 0.0, y, h), expected, strict=True):
-        assert np.abs(a - b).max() < 1e-12
-
-
 def test_systems_without_compiled_vectors_say_so():
     driven = HamiltonianSystem.from_sympy("p**2/2 + q**2/2 + q*cos(t)", time="t", y0=[1.0, 0.0])
     with pytest.raises(ValueError, match=r"`system` .* depends on t"):

@@ -5,15 +5,11 @@ from functools import partial
 
 import numpy as np
 import pytest
-from watchdog import watched
 
 from sympflow import HamiltonianSystem, solve
-from sympflow.hamiltonian.parts import linear_and_rest
 from sympflow.kernels import terms
 from sympflow.kernels.array_splittings import term_code
-from sympflow.kernels.parts_loops import parts_loops
 from sympflow.kernels.protocol import Task, run_states
-from sympflow.kernels.splitting_loops import splitting_loops
 from sympflow.kernels.splittings import Splitting, SplittingCode
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL
 
@@ -71,37 +67,6 @@ def test_loops_over_terms_are_the_stages_that_are_written_out(kind, compensated,
         found.append(np.delete(run.states, 5, axis=0))
     assert np.abs(found[0]).max() < 1e3
     assert np.abs(found[0] - found[1]).max() < 1e-12 * np.abs(found[0]).max()
-
-
-def test_code_does_not_depend_on_how_many_terms_there_are(monkeypatch):
-    texts = set()
-    monkeypatch.setattr("sympflow.kernels.runs.compiled", lambda text, *_: texts.add(text))
-    for n in (20, 40):
-        x = ["0", *(f"q{i}" for i in range(1, n + 1)), "0"]
-        springs = [f"({b} - {a})**2/2 + ({b} - {a})**3/{k + 3}" for k, (a, b) in enumerate(itertools.pairwise(x))]
-        H = HamiltonianSystem.from_sympy(" + ".join([*(f"p{i}**2/2" for i in range(1, n + 1)), *springs]))
-        term_code(Splitting(H.symbols, FORCE_GRADIENT)).function("run", 1)
-    assert len(texts) == 1
-
-
-def test_the_modes_of_many_degrees_of_freedom_are_arrays():
-    assert solve(SYSTEM, "impulse", (0, 0.1), dt=0.05).stats["backend"] != "compiled"
-    with pytest.raises(ValueError, match=r"^`system` is too large for compiled flows of its parts"):
-        parts_loops(linear_and_rest(SYSTEM))
-
-
-@pytest.mark.parametrize(
-    "expression",
-    [
-        " + ".join(f"1/(q{i} - q{j})**12 - 2/(q{i} - q{j})**6" for i in range(1, 5) for j in range(1, i)),
-        " - ".join(["0", *(f"1/sqrt((q{i} - q{j})**2 + 0.01)" for i in range(1, 4) for j in range(1, i))]),
-        "(q1 + 2*q2 + 3*q3 + 1)**8 + (q1 - q2)**10",
-    ],
-)
-def test_kicks_are_arranged_without_factoring_what_takes_minutes(expression):
-    system = HamiltonianSystem.from_sympy(f"p1**2/2 + p2**2/2 + p3**2/2 + {expression}")
-    with watched():
-        assert 0 < splitting_loops(system).kick_cycles(1) < splitting_loops(system).kick_cycles(2)
 
 
 def test_systems_of_very_many_kinds_of_terms_run_as_arrays_and_say_why(monkeypatch):
