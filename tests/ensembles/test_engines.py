@@ -3,11 +3,7 @@
 import importlib.util
 import multiprocessing
 import os
-import re
 import signal
-import sys
-import threading
-import types
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
@@ -64,46 +60,6 @@ def example():
     return module
 
 
-def test_the_job_script_asks_for_what_the_example_says(monkeypatch):
-    script, module = (CLUSTER / "job.sh").read_text(encoding="utf-8"), example()
-    job, asked = module.JOB, dict(re.findall(r"#SBATCH (--?[\w-]+)[ =](\S+)", script))
-    assert asked["-p"] == job["queue"]
-    assert asked["-t"] == job["walltime"]
-    assert int(asked["--cpus-per-task"]) == job["cores"]
-    assert asked["--mem"] == f"{round(int(job['memory'].removesuffix('GB')) * 1e9 / 2**30)}G"
-    assert all(f"#SBATCH {line}" in script for line in job["job_extra_directives"])
-    assert all(line in script for line in job["job_script_prologue"])
-    assert " ".join(job["worker_extra_args"]) in script
-    assert f"--nworkers {job['processes']}" in script
-    assert f"--nthreads {job['cores'] // job['processes']} " in script
-    if importlib.util.find_spec("dask_jobqueue"):
-        with module.slurm_cluster() as cluster:
-            made = cluster.job_script()
-        assert re.findall("#SBATCH.*", made) == re.findall("#SBATCH.*", script)
-    else:
-        given = {}
-        stand_in = types.SimpleNamespace(SLURMCluster=lambda **settings: given.update(settings))
-        monkeypatch.setitem(sys.modules, "dask_jobqueue", stand_in)
-        module.slurm_cluster()
-        assert given == job
-
-
 def test_the_example_runs(tmp_path):
     result = example().run(1, 64, str(tmp_path / "a.zarr"))
     assert result.energy_error.max() < 1e-3
-
-
-@pytest.mark.slow
-def test_compiling_in_several_threads_at_once():
-    """Threads of a program that calls ensembles at the same time."""
-    system = sympflow.HamiltonianSystem.from_sympy("p**2/2 + q**2/2 + q**4/17", y0=[1.0, 0.0], dt=0.1)
-    found = []
-    threads = [
-        threading.Thread(target=lambda: found.append(sympflow.ensemble(system, "verlet", (0, 1)).y)) for _ in range(3)
-    ]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert len(found) == 3
-    assert all(np.array_equal(y, found[0]) for y in found)

@@ -2,9 +2,6 @@
 
 import errno
 import os
-import signal
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -79,34 +76,6 @@ def test_two_programs_share_a_store(tmp_path):
     result = run(store=path, progress=other)
     for y in (result.y, others[0], run(store=path, resume=True).y):
         assert np.array_equal(y, run().y, equal_nan=True)
-
-
-KILLED = """
-import os, signal, sys
-import numpy as np
-import sympflow
-
-system = sympflow.systems.henon_heiles()
-states = np.load(sys.argv[1])
-
-def stop(done, total):
-    if done >= 130:
-        os.kill(os.getpid(), signal.SIGKILL)
-
-sympflow.ensemble(system, "verlet", (0, 1), states, dt=0.1, t_eval=[0.0, 0.5, 1.0], chunk=64,
-                  store=sys.argv[2], progress=stop)
-"""
-
-
-@pytest.mark.slow
-def test_a_killed_program_goes_on(tmp_path):
-    np.save(tmp_path / "states.npy", STATES)
-    words = [sys.executable, "-c", KILLED, str(tmp_path / "states.npy"), str(tmp_path / "a.zarr")]
-    assert subprocess.run(words, check=False, capture_output=True).returncode == -signal.SIGKILL
-    told = []
-    result = run(store=tmp_path / "a.zarr", resume=True, progress=lambda done, total: told.append(done))
-    assert told[0] >= 128
-    assert np.array_equal(result.y, run().y, equal_nan=True)
 
 
 def test_a_store_that_is_there_or_of_another_ensemble(tmp_path):

@@ -34,25 +34,6 @@ def test_the_same_bits_whatever_the_workers_and_chunks(engine, chunk):
     assert np.array_equal(kept(reduce="final", workers=engine, chunk=chunk).final, reference)
 
 
-@pytest.mark.parametrize(("method", "options"), [("verlet", {"backend": "array"}), ("dop853", {})])
-def test_the_same_bits_where_python_runs(method, options):
-    def final(chunk):
-        return sympflow.ensemble(SYSTEM, method, (0, 1), STATES[:80], reduce="final", chunk=chunk, **options).final
-
-    reference = final(80)
-    for chunk in (1, 7, 64):
-        assert np.array_equal(final(chunk), reference)
-
-
-@pytest.mark.slow
-def test_a_chunk_of_one_orbit_of_a_flow():
-    def final(chunk):
-        return sympflow.ensemble(SYSTEM, "sympflow", (0, 1), STATES[:9], reduce="final", chunk=chunk).final
-
-    reference = final(9)
-    assert all(np.array_equal(final(chunk), reference) for chunk in (1, 4))
-
-
 def test_a_failed_orbit_is_a_row():
     states = STATES.copy()
     states[[3, 70]] = 60.0
@@ -75,14 +56,6 @@ def test_no_orbit_is_asked_when_its_solution_becomes_infinite(monkeypatch):
     assert sympflow.solve(SYSTEM, "verlet", SPAN, states, dt=DT, diagnose=False).status.tolist() == [0, -1]
     with pytest.raises(TypeError, match="`diagnose` must be True or False"):
         sympflow.solve(SYSTEM, "verlet", SPAN, states, dt=DT, diagnose=2)
-
-
-def test_states_are_drawn_alike_in_any_chunks():
-    def drawn(y0, chunk):
-        return sympflow.ensemble(SYSTEM, "verlet", (0, 1), y0, n=5000, seed=3, chunk=chunk, reduce="final", dt=DT).final
-
-    for y0 in (SYSTEM.domain, lambda rng, n: 0.1 * rng.standard_normal((n, 4))):
-        assert np.array_equal(drawn(y0, 5000), drawn(y0, 999))
 
 
 def test_a_users_function():
@@ -120,36 +93,6 @@ def test_a_grid_of_parameters():
         assert np.allclose(swept(reduce="energy_error").energy_error[i, 1], worst, atol=1e-13)
     fixed = sympflow.ensemble(system, "verlet", (0, 2), states, dt=0.1, params={"k": 2.0}, reduce="final")
     assert fixed.final.shape == (2, 2)
-
-
-def test_values_without_a_system_fail_their_orbits():
-    system = sympflow.HamiltonianSystem.from_sympy("p**2/(2*m) + q**2/2", params={"m": 1.0})
-    for values, message in (([1.0, np.nan], "m = nan at 1"), ([[1.0]], r"a list of them; got shape \(1, 1\)")):
-        with pytest.raises(ValueError, match=f"`params` .*{message}"):
-            sympflow.ensemble(system, "verlet", (0, 1), [1.0, 0.0], params={"m": values}, dt=0.1)
-    for backend in ("auto", "array"):
-        how = {"params": {"m": [2.0, 0.0, 3.0]}, "dt": 0.1, "reduce": "final", "backend": backend}
-        result = sympflow.ensemble(system, "verlet", (0, 1), [[1.0, 0.0], [0.0, 1.0]], **how)
-        assert result.status.tolist() == [[0, 0], [-1, -1], [0, 0]]
-        assert "m = 0" in result.messages[1, 1]
-        assert np.isfinite(result.final).all(axis=-1).tolist() == (result.status == 0).tolist()
-
-
-def test_energy_errors_where_some_values_drive_the_system():
-    H = "p**2/2 + q**2/2 - (a - b)*q*cos(t)"
-    system = sympflow.HamiltonianSystem.from_sympy(H, time="t", params={"a": 0.3, "b": 0.0})
-
-    def swept(**params):
-        how = {"params": params, "dt": 0.1, "reduce": "energy_error", "backend": "array"}
-        return sympflow.ensemble(system, "verlet", (0, 1), [[1.0, 0.0], [0.0, 1.0]], **how)
-
-    for values in ([0.0, 0.1], [0.1, 0.0]):
-        with pytest.raises(ValueError, match=r"`system` .* is driven, H depends on t, so its energy is not kept"):
-            swept(a=values)
-    result = swept(a=[0.3, 0.2], b=[0.3])
-    assert result.status.tolist() == [[[0, 0]], [[-1, -1]]]
-    assert "`params` has a = 0.2, b = 0.3: `system`" in result.messages[1, 0, 1]
-    assert np.isfinite(result.energy_error).all(axis=(1, 2)).tolist() == [True, False]
 
 
 @pytest.mark.parametrize(
@@ -223,17 +166,17 @@ def test_numbers_of_a_function_are_kept_or_the_row_fails():
     assert kept(reduce=kinds).real[3] == 1j
 
 
-class Wrong(reductions.Final):
-    def fields(self, problem):
-        return {"count": ((), np.dtype(int))}
-
-    def reduce(self, chunk):
-        return {"count": np.full(len(chunk), 1.5)}
+def test_progress():
+    told = []
+    kept(reduce="final", chunk=50, progress=lambda done, total: told.append((done, total)))
+    assert told == [(0, 200), (50, 200), (100, 200), (150, 200), (200, 200)]
 
 
-def test_a_reduction_returns_what_it_tells():
-    with pytest.raises(TypeError, match="`reduce` returns count as float64, which its `fields` told as int64"):
-        kept(reduce=Wrong())
+def test_masked_values_of_a_reduction_are_missing():
+    found = kept(reduce=lambda t, y: {"a": np.ma.array([1.0, 2.0], mask=[False, True]), "b": np.ma.array([3, 4])})
+    assert (found.a[:, 0] == 1).all()
+    assert np.isnan(found.a[:, 1]).all()
+    assert (found.b == [3, 4]).all()
 
 
 def test_what_is_sent_to_processes_is_small_and_can_be_sent():
@@ -244,10 +187,17 @@ def test_what_is_sent_to_processes_is_small_and_can_be_sent():
         kept(reduce=lambda t, y: float(lock.locked()), workers=2)
 
 
-def test_progress():
-    told = []
-    kept(reduce="final", chunk=50, progress=lambda done, total: told.append((done, total)))
-    assert told == [(0, 200), (50, 200), (100, 200), (150, 200), (200, 200)]
+def test_values_without_a_system_fail_their_orbits():
+    system = sympflow.HamiltonianSystem.from_sympy("p**2/(2*m) + q**2/2", params={"m": 1.0})
+    for values, message in (([1.0, np.nan], "m = nan at 1"), ([[1.0]], r"a list of them; got shape \(1, 1\)")):
+        with pytest.raises(ValueError, match=f"`params` .*{message}"):
+            sympflow.ensemble(system, "verlet", (0, 1), [1.0, 0.0], params={"m": values}, dt=0.1)
+    for backend in ("auto", "array"):
+        how = {"params": {"m": [2.0, 0.0, 3.0]}, "dt": 0.1, "reduce": "final", "backend": backend}
+        result = sympflow.ensemble(system, "verlet", (0, 1), [[1.0, 0.0], [0.0, 1.0]], **how)
+        assert result.status.tolist() == [[0, 0], [-1, -1], [0, 0]]
+        assert "m = 0" in result.messages[1, 1]
+        assert np.isfinite(result.final).all(axis=-1).tolist() == (result.status == 0).tolist()
 
 
 @pytest.mark.parametrize("method", ["verlet", "implicit_midpoint"])
@@ -270,8 +220,9 @@ def test_windows_are_pieces_of_the_run(method, monkeypatch):
     assert cut.status.tolist() == whole.status.tolist()
 
 
-def test_masked_values_of_a_reduction_are_missing():
-    found = kept(reduce=lambda t, y: {"a": np.ma.array([1.0, 2.0], mask=[False, True]), "b": np.ma.array([3, 4])})
-    assert (found.a[:, 0] == 1).all()
-    assert np.isnan(found.a[:, 1]).all()
-    assert (found.b == [3, 4]).all()
+def test_states_are_drawn_alike_in_any_chunks():
+    def drawn(y0, chunk):
+        return sympflow.ensemble(SYSTEM, "verlet", (0, 1), y0, n=5000, seed=3, chunk=chunk, reduce="final", dt=DT).final
+
+    for y0 in (SYSTEM.domain, lambda rng, n: 0.1 * rng.standard_normal((n, 4))):
+        assert np.array_equal(drawn(y0, 5000), drawn(y0, 999))

@@ -83,12 +83,6 @@ def test_each_trajectory_has_its_times_and_arrays_have_names(data, options, runs
         assert_same(Trajectories.read(tmp_path / "runs.npz", **options), runs)
 
 
-def test_dictionaries_of_columns_are_tables():
-    pytest.importorskip("pandas")
-    assert_same(Trajectories.read({"t": t, "q": RUN[0], "p": RUN[1]}), [(t, RUN)])
-    assert_same(Trajectories.read({"t": t, "w": RUN[1], "a": RUN[0]}, q=["a"], p=["w"]), [(t, RUN)])
-
-
 @pytest.mark.parametrize(("ending", "by"), [(".csv", ","), (".txt", " "), (".tsv", "\t")])
 def test_files_without_names_are_refused_unless_a_comment_has_them(tmp_path, ending, by):
     pytest.importorskip("pandas")
@@ -103,13 +97,6 @@ def test_files_without_names_are_refused_unless_a_comment_has_them(tmp_path, end
 
 def no_engine(path):
     raise ImportError("Unable to find a usable engine")
-
-
-def test_parquet_is_read_where_it_can_be(tmp_path):
-    pd = pytest.importorskip("pandas")
-    pytest.importorskip("pyarrow")
-    pd.DataFrame({"t": t, "q": RUN[0], "p": RUN[1]}).to_parquet(tmp_path / "run.parquet")
-    assert_same(Trajectories.read(tmp_path / "run.parquet"), [(t, RUN)])
 
 
 def test_tables_and_datasets_are_read_by_their_names(tmp_path, monkeypatch):
@@ -213,38 +200,6 @@ def test_units_and_orders():
     np.testing.assert_allclose(units[:2] * units[2:], pairs.scaling.action)  # dq∧dp is scaled alike
 
 
-def test_sets_are_divided_by_trajectory_and_long_runs_into_pieces():
-    many = Trajectories.read((t, np.arange(120.0).reshape(10, 2, 6)))
-    kept, held = many.split(0.3, seed=1)
-    firsts = [run.y[0, 0] for run in (*kept.runs, *held.runs)]
-    assert (len(kept.runs), len(held.runs), sorted(firsts)) == (7, 3, [12.0 * i for i in range(10)])
-    again = many.split(0.3, seed=1)[1]
-    assert [run.y[0, 0] for run in again.runs] == [run.y[0, 0] for run in held.runs]
-    one = Trajectories.read((t, RUN))
-    assert [run.n_points for run in one.pieces(points=4).runs] == [4, 2]
-    assert [run.n_points for run in one.pieces(points=5).runs] == [6]  # no piece of one point
-    assert [run.n_points for run in one.pieces(span=0.4).runs] == [3, 3]
-    assert [run.n_points for run in one.pieces(span=1e-9).runs] == [2, 2, 2]
-    assert np.array_equal(np.concatenate([run.y for run in one.pieces(span=0.4).runs], 1), RUN)
-    with pytest.raises(ValueError, match="one trajectory only"):
-        one.split()
-    with pytest.raises(ValueError, match="`points` must be an integer, 2 or more"):
-        one.pieces(points=1)
-
-
-def test_of_few_trajectories_each_is_left_out_in_turn():
-    many = Trajectories.read((t, np.arange(240.0).reshape(20, 2, 6)))
-    ((kept, held),) = many.subset(range(8)).folds(0.2)
-    assert (len(kept.runs), len(held.runs)) == (5, 3)  # three at least
-    ((kept, held),) = many.folds(0.2)
-    assert (len(kept.runs), len(held.runs)) == (16, 4)
-    folds = many.subset(range(3)).folds()
-    assert [[run.y[0, 0] for run in held.runs] for _, held in folds] == [[0.0], [12.0], [24.0]]
-    assert [[run.y[0, 0] for run in kept.runs] for kept, _ in folds] == [[12.0, 24.0], [0.0, 24.0], [0.0, 12.0]]
-    with pytest.raises(ValueError, match="one trajectory only"):
-        many.subset([0]).folds()
-
-
 def test_angles_that_were_wrapped_are_noticed_and_continued():
     times = np.linspace(0, 10, 40)
     turning = np.stack([1.3 * times - 2.0, 1.3 + 0.1 * np.sin(times)])
@@ -317,14 +272,6 @@ def test_the_order_is_that_of_columns_with_names_of_their_own_and_of_trajectorie
     assert Trajectories.read(named, order="pairs").names == ("q1", "q2", "p1", "p2")
 
 
-def test_the_unit_of_a_column_goes_before_that_of_all():
-    for units in ({"q": "deg", "q1": "rad"}, {"q1": "rad", "q": "deg"}):
-        q = Trajectories.read((t, FOUR), units=units).runs[0].y[:2]
-        assert np.allclose(q, FOUR[:2] * [[1], [np.pi / 180]], rtol=1e-15)
-    with pytest.raises(TypeError, match="`units` must be a dictionary"):
-        Trajectories.read((t, FOUR), units="ms")
-
-
 @pytest.mark.parametrize("data", [None, 3.0, "no.such.kind", [1, 2], [(t,)], (t, RUN * 1j)])
 def test_what_is_no_data_is_refused(data):
     with pytest.raises((TypeError, FileNotFoundError), match="`data"):
@@ -345,23 +292,6 @@ def test_files_that_cannot_be_read_are_named(tmp_path, name, content):
     (tmp_path / name).write_bytes(content)
     with pytest.raises(ValueError, match=rf"^`data` names the file .*{name}.*cannot be read .*check that it is whole"):
         Trajectories.read(tmp_path / name)
-
-
-TABLES = [{"t": t, "q": RUN[0], "p": RUN[1]}, {"t": 2 * t, "q": 2 * RUN[0], "p": 2 * RUN[1]}]
-
-
-@pytest.mark.parametrize(
-    "made",
-    [
-        lambda pd: TABLES,
-        lambda pd: [pd.DataFrame(one) for one in TABLES],
-        lambda pd: pd.concat([pd.DataFrame(one).assign(run=i) for i, one in enumerate(TABLES)]).to_dict("records"),
-        lambda pd: pd.concat([pd.DataFrame(one).assign(run=i) for i, one in enumerate(TABLES)]).set_index(["run", "t"]),
-    ],
-    ids=["dictionaries", "tables", "rows", "times in the index"],
-)
-def test_tables_come_one_by_one_in_rows_or_with_an_index(made):
-    assert_same(Trajectories.read(made(pytest.importorskip("pandas"))), EACH)
 
 
 @pytest.mark.parametrize(

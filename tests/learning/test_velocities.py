@@ -6,13 +6,11 @@ import numpy as np
 import pytest
 
 import sympflow
-from sympflow.learning.families import FAMILIES, Constraints, families, pruned
+from sympflow.learning.families import FAMILIES
 from sympflow.learning.fitting import Setting, fitted
-from sympflow.learning.lagrangian import lagrangian_start, told
+from sympflow.learning.lagrangian import lagrangian_start
 from sympflow.learning.learner import _constraints
-from sympflow.learning.models import Model, friction
-from sympflow.learning.orbits import first_states
-from sympflow.learning.parts import Fixed, Polynomial, kinetic, known_kinetic
+from sympflow.learning.models import friction
 from sympflow.learning.trajectories import Trajectories
 from sympflow.systems import double_pendulum
 
@@ -56,21 +54,6 @@ def test_lagranges_equations_give_the_masses_of_a_double_pendulum(observed):
     seen = y[0] if observed == "qp" else np.concatenate([y[0, :2], v[:2]])
     right = np.gradient(v[:2], t, axis=1)[:, 5:-5]
     found = accelerations(model, theta, seen)[:, 5:-5]
-    assert np.sqrt(np.mean((found - right) ** 2)) < 0.01 * right.std()
-
-
-@pytest.mark.parametrize("observed", ["qp", "qv"])
-def test_terms_that_smooth_curves_do_not_ask_for_are_left_out(observed):
-    """A dozen of 51 numbers are kept, with accelerations to 1 %: those of all numbers are worthless elsewhere."""
-    data, y = observations(double_pendulum(), observed, noise=1e-3)
-    kept = [*FAMILIES["inertia"].models(_constraints(data, None, None, False, 2 * np.pi, None))][1]
-    for _ in range(3):
-        kept = pruned(kept, *told(kept.model, data), data.n_values) or kept
-    assert kept.model.n < 13
-    v = double_pendulum().vector_field(y[0].T).T
-    right = np.einsum("nij,nj->in", double_pendulum().field_jacobian(y[0].T), v.T)[:2]
-    seen = y[0] if observed == "qp" else np.concatenate([y[0, :2], v[:2]])
-    found = accelerations(kept.model, told(kept.model, data)[0], seen)
     assert np.sqrt(np.mean((found - right) ** 2)) < 0.01 * right.std()
 
 
@@ -134,16 +117,6 @@ def test_friction_is_told_by_velocities():
     assert found.theta[-1] == pytest.approx(0.2, abs=1e-6)
 
 
-def test_the_noise_of_velocities_biases_nothing():
-    """Within four standard errors; of velocities that nobody observed there is no noise."""
-    for observed in ("qv", "q"):
-        data, _ = observations(PENDULUM, observed, runs=10, noise=0.01)
-        found = fitted(candidate("waves", data, 0, 2 * np.pi), data, Setting())
-        error = np.sqrt(found.fit.covariance()[0, 0])
-        assert abs(found.theta[0] + 2) < 4 * error < 0.2  # V = −2cos q, with M = 1
-        assert found.sigma[0] == pytest.approx(0.01, rel=0.1)
-
-
 def test_learn_gives_h_and_the_momenta():
     spring = sympflow.HamiltonianSystem.from_sympy("p**2 + q**2", name="spring")
     data, y = observations(spring, "qv", noise=0.005)
@@ -157,60 +130,6 @@ def test_learn_gives_h_and_the_momenta():
     assert flow.figures["energy_scatter"] < 0.02
 
 
-@pytest.mark.parametrize(
-    ("system", "v"),
-    [(PENDULUM, [[0.6]]), (CHARGE, [[0.6, -0.4]]), (double_pendulum(), [[0.6, -0.4]]),
-     (sympflow.HamiltonianSystem.from_sympy("sqrt(1 + p**2) + q**2"), [[0.6]])],
-    ids=lambda value: getattr(value, "name", None),
-)  # fmt: skip
-def test_momenta_are_those_of_velocities(system, v):
-    q = 0.3 * np.ones((1, system.ndof))
-    found = system.vector_field(np.concatenate([q, system.momenta(q, np.array(v))], axis=1))[:, : system.ndof]
-    assert found == pytest.approx(np.array(v), abs=1e-12)
-
-
 def test_velocities_of_no_momenta_are_refused():
     with pytest.raises(ValueError, match="`v`: Newton's method finds no momenta"):
         sympflow.HamiltonianSystem.from_sympy("sqrt(1 + p**2) + q**2").momenta(np.zeros((1, 1)), np.full((1, 1), 2.0))
-
-
-def test_families_are_those_that_velocities_tell():
-    constraints = Constraints(np.ones(4), None, None, None, np.full(4, np.inf), velocities=True, middle=np.zeros(2))
-    assert families(constraints, None) == ["central", "pairs", "waves", "polynomial", "network", "inertia", "magnetic"]
-    assert "magnetic" not in families(replace(constraints, velocities=False), None)
-    with pytest.raises(ValueError, match="`family` 'whole-polynomial' does not apply"):
-        families(constraints, "whole-polynomial")
-    for known, parts in ((None, 2), (np.eye(2), 1)):
-        assert len(replace(constraints, inverse_mass=known).kinetic()) == parts
-
-
-def test_curves_on_which_velocities_are_no_free_numbers_give_a_start():
-    """On circles q' is a function of q and a centre, so that p = v has many solutions, some of no positive mass."""
-    random, s = np.random.default_rng(0), np.linspace(0, 10, 60)
-    c, r, f = random.normal(size=(2, 12, 1)), random.uniform(0.3, 2, (12, 1)), random.uniform(0, 6.3, (12, 1))
-    parts = c[0] + r * np.cos(s + f), c[1] + r * np.sin(s + f), -r * np.sin(s + f), r * np.cos(s + f)
-    y = np.stack(parts, axis=1) + 0.01 * random.normal(size=(12, 4, 60))
-    data = Trajectories.read((s, y), observed="qv")
-    found = next(FAMILIES["inertia"].models(_constraints(data, None, None, False, None, None)))
-    for _ in range(2):
-        fewer = pruned(found, *told(found.model, data.sample), data.n_values)
-        found = fewer or found
-    theta, precision = told(found.model, data.sample)
-    assert np.isfinite(theta).all()
-    assert precision.shape == (found.model.n, found.model.n)
-
-
-def test_only_the_factor_of_h_is_given():
-    """(M⁻¹)₁₁ = 1 beside the numbers of all others."""
-    constraints = Constraints(np.ones(4), None, None, None, np.full(4, np.inf), velocities=True, middle=np.zeros(2))
-    model = constraints.separated(Polynomial.up_to(2, "q", np.ones(2)))
-    assert model.n == kinetic([1.0, 1.0]).n - 1 + 5
-    assert isinstance(model.parts[0], Fixed)
-    W = model.field(np.ones(model.n), np.eye(4), True, False).slope[:2, 2:]
-    assert np.broadcast_to(W, (2, 2, 4))[..., 0] == pytest.approx(np.array([[1.0, 1.0], [1.0, 2.0]]))
-
-
-def test_the_first_velocity_is_the_slope_of_the_positions():
-    data, y = observations(PENDULUM, "q")
-    starts = first_states(data, Model(1, (known_kinetic(np.eye(1)),), velocities=True), np.zeros(0))
-    assert starts[:, 1] == pytest.approx(2 * y[:, 1, 0], abs=0.02)  # of a cubic over 0.36

@@ -2,8 +2,6 @@
 
 import numpy as np
 import pytest
-from conftest import load_example
-from scipy.interpolate import CubicSpline
 
 import sympflow
 from sympflow import HamiltonianSystem
@@ -50,24 +48,6 @@ def test_orbits_do_not_depend_on_their_neighbours_nor_on_how_often_they_are_look
     np.testing.assert_array_equal(full.value, again.value)
 
 
-def test_a_chaotic_orbit_is_told_from_a_regular_one(wells):
-    index = sympflow.sali(wells, "verlet", (0, 3000), BOTH, dt=0.1)
-    assert index.status.tolist() == [1, 0]
-    assert index.success
-    assert index.value[0] < 1e-12
-    assert 300 < index.t_end[0] < 1500  # exp(−λt) = 1e-12, λ about 0.04
-    assert index.value[1] > 0.1
-    assert "1 of 2 orbits ended early" in index.message
-
-
-@pytest.mark.slow
-def test_the_exponents_of_henon_heiles(wells):
-    exponents = sympflow.lyapunov(wells, "verlet", (0, 2e5), BOTH, dt=0.1, t_eval=[2e3, 2e4])
-    assert 0.035 < exponents.value[0] < 0.055  # 0.047 by Skokos (2001)
-    # the vectors of a regular orbit grow like t
-    assert (exponents.history[1] < 2 * np.log(exponents.t) / exponents.t).all()
-
-
 @pytest.mark.parametrize(
     ("k", "power"), [(2, 0), *(pytest.param(k, 4 - 2 * k, marks=pytest.mark.slow) for k in (3, 4))]
 )
@@ -76,32 +56,6 @@ def test_gali_on_a_torus_falls_by_its_power(wells, k, power):
     index = sympflow.gali(wells, "verlet", (0, 4000), [REGULAR], k=k, dt=0.1, below=0, t_eval=times)
     slope = np.polyfit(np.log(index.t), np.log(index.history[0]), 1)[0]
     assert slope == pytest.approx(power, abs=0.3)
-
-
-def test_gali_of_two_vectors_is_sali_times_the_other_diagonal(wells):
-    s = sympflow.sali(wells, "verlet", (0, 50), BOTH, dt=0.1, below=0).value
-    g = sympflow.gali(wells, "verlet", (0, 50), BOTH, dt=0.1, below=0).value
-    np.testing.assert_allclose(g, s * np.sqrt(4 - s**2) / 2, rtol=1e-12)
-
-
-@pytest.mark.slow
-def test_the_exponent_of_a_ridge_with_friction():
-    """λ of q'' = q − γq' is (−γ + √(γ² + 4))/2; the verlet step has this rate up to O(h²)."""
-    y0, gamma = [1e-3, 2e-3], 0.4
-    system = HamiltonianSystem.from_sympy("p**2/2 - q**2/2", damping=gamma, name="ridge")
-    compiled, arrays = both_ways(sympflow.lyapunov, system, "verlet", (0, 40), y0, dt=0.02, deviations=[1.0, 0.5])
-    np.testing.assert_allclose(compiled.value, arrays.value, rtol=1e-10)
-    np.testing.assert_allclose(compiled.value, (-gamma + np.sqrt(gamma**2 + 4)) / 2, atol=0.02)
-
-
-@pytest.mark.slow
-def test_parameters_and_coupled_masses_are_those_of_the_system():
-    for stiffness in (1.0, 2.5):  # one code for both values
-        system = HamiltonianSystem.from_sympy(
-            "p1**2/2 + p1*p2/4 + p2**2 - k*cos(q1)*cos(q2)", params={"k": stiffness}, name="coupled"
-        )
-        compiled, arrays = both_ways(sympflow.lyapunov, system, "verlet", (0, 20), [0.7, 0.5, 0.1, 0.3], dt=0.1)
-        assert compiled.value == pytest.approx(arrays.value, rel=1e-9)
 
 
 def test_vectors_of_a_driven_system_are_those_of_neighbouring_orbits():
@@ -119,22 +73,6 @@ def test_vectors_of_a_driven_system_are_those_of_neighbouring_orbits():
         sympflow.lyapunov(system, "dop853", (0, 1), [y0, y0])
 
 
-def test_deviations_end_where_the_samples_of_a_drive_do():
-    drive = CubicSpline([0, 1, 2, 3], [0.1, 0.0, 0.2, 0.1])
-    system = HamiltonianSystem.from_sympy("p**2/2 - cos(q)*(1 + a)", params={"a": drive}, y0=[0.5, 0.1])
-    with pytest.raises(ValueError, match=r"^`t_span` \(0, 4\) leaves the samples"):
-        sympflow.lyapunov(system, "verlet", (0, 4), dt=0.1)
-    with pytest.raises(ValueError, match=r"^`t_span` \(0, 4\) leaves the samples"):
-        sympflow.ensemble(system, "verlet", (0, 4), [[0.5, 0.1]], dt=0.1, reduce="sali")
-
-
-@pytest.mark.slow
-def test_the_picture_is_drawn(tmp_path, capsys):
-    load_example("sali_map").main(["--quick", "--out", str(tmp_path / "map.png")])
-    assert "1,082 orbits" in capsys.readouterr().out
-    assert (tmp_path / "map.png").stat().st_size > 10_000
-
-
 METHODS = [
     ("dop853", {"rtol": 1e-10, "atol": 1e-12}),
     pytest.param("gauss_legendre6", {"dt": 0.1}, marks=pytest.mark.slow),
@@ -148,11 +86,6 @@ def test_other_methods(wells, method, options):
         for name, given in (("kahan_li8", {"dt": 0.1}), (method, options))
     )
     np.testing.assert_allclose(found.value, exact.value, rtol=1e-6)
-
-
-def test_backwards(wells):
-    back = both_ways(sympflow.sali, wells, "verlet", (0, -10), BOTH, dt=0.1, t_eval=[-3, -5], below=0)
-    np.testing.assert_allclose(back[0].history, back[1].history, rtol=1e-9)
 
 
 @pytest.mark.parametrize("function", [sympflow.lyapunov, sympflow.sali])
@@ -186,9 +119,6 @@ def test_bad_arguments(wells, arguments, message):
     arguments = {"method": "verlet", **arguments}
     with pytest.raises(ValueError, match=message):
         sympflow.sali(wells, t_span=(0, 200), y0=REGULAR, **arguments)
-
-
-def test_more_vectors_than_dimensions(wells):
     with pytest.raises(ValueError, match="`k` must be from 2 to 4"):
         sympflow.gali(wells, "verlet", k=5)
 
@@ -232,15 +162,6 @@ def test_vectors_of_large_systems_are_moved_by_the_derivative_of_the_step(name, 
     moved = integrator.jvp(system, 0.0, y, h, W)
     expected = forward_tangent(lambda x, s: integrator.step(system, 0.0, x, s), y, h)[1] @ W
     np.testing.assert_allclose(moved, expected, rtol=0, atol=1e-12)
-
-
-@pytest.mark.parametrize("method", ["srkn6b", "chin4a", "linear_srkn6b"])
-def test_the_exponent_of_a_lattice_is_that_of_its_coordinates(method):
-    lattice = HamiltonianSystem.lattice(bond="r**2/2 + r**4/4", shape=8)
-    written = HamiltonianSystem.from_sympy(str(lattice.local.written_out()))
-    y0 = np.random.default_rng(0).normal(size=16) / 2
-    found = [sympflow.lyapunov(system, method, (0, 10), y0, dt=0.05) for system in (lattice, written)]
-    assert found[0].value == pytest.approx(found[1].value, abs=1e-12)
 
 
 def test_a_large_lattice_has_vectors_without_matrices():

@@ -41,15 +41,3 @@ def test_kinetic_energies_that_depend_on_the_time_and_autonomous_systems():
     assert energy_balance_error(sol).max() < 1e-11
     alone = solve(sympflow.systems.pendulum(), "verlet", (0, 5), dt=0.1)
     assert np.allclose(energy_balance_error(alone), np.abs(sympflow.energy_error(alone, relative=False)), atol=1e-15)
-
-
-def test_friction_is_refused():
-    system = HamiltonianSystem.from_sympy("p**2/2 + q**2/2 - q*cos(t)", time="t", damping=0.1)
-    with pytest.raises(ValueError, match=r"`system`.*friction"):
-        energy_balance_error(solve(system, "verlet", (0, 1), [1.0, 0.0], dt=0.1))
-
-
-def test_drives_with_kinks_are_balanced_too():
-    system = HamiltonianSystem.from_sympy("p**2/2 + q**2/2 - q*abs(sin(t))", time="t")
-    sol = solve(system, "kahan_li8", (0, 20), Y0, dt=0.05)
-    assert energy_balance_error(sol).max() < 1e-11

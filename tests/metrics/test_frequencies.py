@@ -7,7 +7,7 @@ from scipy.special import ellipk
 
 import sympflow
 from sympflow.metrics.frequencies import lines
-from sympflow.systems import harmonic_oscillator, henon_heiles_escape, pendulum
+from sympflow.systems import henon_heiles_escape, pendulum
 
 
 def test_lines_of_a_quasi_periodic_signal():
@@ -17,15 +17,6 @@ def test_lines_of_a_quasi_periodic_signal():
     np.testing.assert_allclose(omega[0, 0, :3], [1, -np.sqrt(2), 0.3], atol=1e-10)
     np.testing.assert_allclose(amplitude[0, 0, :3], [2, 0.5j, 1e-3], atol=1e-8)
     assert abs(amplitude[0, 0, 3]) < 1e-7 or np.isnan(omega[0, 0, 3])
-
-
-def test_the_frequency_of_an_oscillator():
-    system = harmonic_oscillator()
-    found = sympflow.frequencies(system, "impulse", (0, 100), [1.0, 0.0], dt=0.1, n=2)  # its flow is exact
-    assert found.frequencies[0, 0] == pytest.approx(1, abs=1e-13)
-    assert np.isnan(found.frequencies[0, 1])  # there is no other line
-    assert found.amplitudes[0, 0] == pytest.approx(1, abs=1e-12)
-    assert found.success
 
 
 def test_the_frequency_of_a_pendulum_is_that_of_the_elliptic_integral():

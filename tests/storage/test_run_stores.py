@@ -189,16 +189,6 @@ def test_the_outputs_are_read_from_the_store_and_by_xarray(tmp_path):
         np.testing.assert_array_equal(data.time, own.time)
 
 
-def test_an_output_outside_the_domain_is_told_once(tmp_path):
-    y0 = np.array([0.0, 0.6, 0.55, 0.0])
-    options = {"dt": 0.05, "on_domain_exit": "warn"}
-    whole = solve(SYSTEM, "verlet", (0, END), y0, **options)
-    stored = solve(SYSTEM, "verlet", (0, END), y0, store=tmp_path / "a", **options)
-    assert "domain_exit" in whole.stats
-    assert stored.stats["domain_exit"] == whole.stats["domain_exit"]
-    assert "The state left the domain at t = " in stored.message
-
-
 REFUSED = [
     ({"store": 3}, TypeError, "`store` must be the path of a folder; got int"),
     ({"resume": "yes"}, TypeError, "`resume` must be True or False; got 'yes'"),

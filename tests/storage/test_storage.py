@@ -2,13 +2,11 @@
 
 import errno
 import os
-import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from sympflow.arguments import put_file
 from sympflow.storage import store as module
 from sympflow.storage.store import Appender, Field, Store, StoreError, difference
 
@@ -85,38 +83,6 @@ def test_a_full_disk_loses_nothing(tmp_path, monkeypatch):
     assert not list(path.rglob(".new-*"))
 
 
-@pytest.mark.skipif(os.name != "posix", reason="permissions are those of POSIX")
-@pytest.mark.parametrize("mask", [0o022, 0o027, 0o002])
-def test_permissions_follow_the_umask(tmp_path, mask):
-    before = os.umask(mask)
-    try:
-        put_file(tmp_path / "state.pt", b"numbers")
-    finally:
-        os.umask(before)
-    assert (tmp_path / "state.pt").stat().st_mode & 0o777 == 0o666 & ~mask
-
-
-def test_damage_is_told(tmp_path):
-    store = made(tmp_path / "run.zarr")
-    chunk = tmp_path / "run.zarr" / "dof" / "0"
-    data = bytearray(chunk.read_bytes())
-    data[9] ^= 1
-    chunk.write_bytes(bytes(data))
-    with pytest.raises(StoreError, match="is damaged: 0 of 'dof'"):
-        store.read("dof")
-    chunk.write_bytes(b"")
-    with pytest.raises(StoreError, match="is damaged"):
-        store.read("dof")
-    chunk.unlink()
-    with pytest.raises(StoreError, match="is damaged: 0 of 'dof' is missing"):
-        store.committed("dof", (0,))
-    store.commit(state={"place": np.ones(3)})
-    (state,) = (tmp_path / "run.zarr").glob(".state-*")
-    state.write_bytes(state.read_bytes()[:40])
-    with pytest.raises(StoreError, match="is damaged: its state"):
-        store.state()
-
-
 def test_what_differs_is_told_where_it_does():
     other = difference({"a": "x" * 300 + "1", "old": "kept"}, {"new": "of a later version", "a": "x" * 300 + "2"})
     assert other == f"its `a` is ...{'x' * 45}1, not ...{'x' * 45}2"
@@ -145,28 +111,3 @@ def test_one_writer_at_a_time(tmp_path):
         pass
     with store.locked():
         pass
-
-
-def test_of_two_that_make_a_store_at_once_one_does(tmp_path, monkeypatch):
-    rename = module.os.rename
-
-    def late(made_by_us, place):
-        shutil.copytree(made_by_us, place)
-        rename(made_by_us, place)
-
-    monkeypatch.setattr(module.os, "rename", late)
-    with pytest.raises(FileExistsError, match=r"`store` '.*run.zarr' exists"):
-        made(tmp_path / "run.zarr")
-    assert [path.name for path in tmp_path.iterdir()] == ["run.zarr"]
-    assert set(Store.open(tmp_path / "run.zarr").fields) == set(FIELDS)
-
-
-def test_chunks_and_their_values_must_fit(tmp_path):
-    store = made(tmp_path / "run.zarr")
-    with pytest.raises(ValueError, match="are not a chunk of 'q'"):
-        store.write("q", (0, 0), np.zeros((2, 5)))
-    with pytest.raises(ValueError, match="must agree"):
-        Field(("a",), (1, 2))
-    assert not store.has("q", (0, 0))
-    assert store.has("dof", (0,))
-    assert np.isnan(store.read("q", (0, 0))).all()

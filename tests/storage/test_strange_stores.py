@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 
 import sympflow
-from sympflow.ensembles.reductions import Final
-from sympflow.storage.store import METADATA, Field, Store, StoreError, is_name, read_arrays
+from sympflow.storage.store import METADATA, StoreError, read_arrays
 
 SYSTEM = sympflow.systems.henon_heiles()
 STATES = SYSTEM.y0 + np.zeros((3, 1))
@@ -218,34 +217,3 @@ def test_what_is_lost_after_a_run_is_said_when_it_is_read(tmp_path):
     (tmp_path / "a" / "p0" / "0.0").unlink()
     ensemble(tmp_path / "a", resume=True)
     assert (tmp_path / "a" / "p0" / "0.0").exists()
-
-
-@pytest.mark.parametrize("name", ["../../evil", "/evil", "a/b", "a\\b", "..", "", ".hidden", "a\nb", "a\0"])
-def test_names_of_a_function_are_names(tmp_path, name):
-    assert not is_name(name)
-    with pytest.raises(ValueError, match=r"`reduce` returns .*, which no array of a `store` can be called"):
-        sympflow.ensemble(SYSTEM, "verlet", (0, 1), STATES, store=tmp_path / "a" / "b", reduce=lambda t, y: {name: 1.0})
-    assert not any(tmp_path.iterdir())
-    kept = sympflow.ensemble(SYSTEM, "verlet", (0, 1), STATES, reduce=lambda t, y: {name: 1.0})
-    assert (kept.fields[name] == 1).all()
-
-
-@pytest.mark.parametrize("name", ["q", "max of E", "Δ", "a.b", "E:max", "status_0"])
-def test_other_names_are_kept(tmp_path, name):
-    assert is_name(name)
-    x = f"x{name}"
-    kept = sympflow.ensemble(SYSTEM, "verlet", (0, 1), STATES, store=tmp_path / "a", reduce=lambda t, y: {x: 1})
-    assert (kept.fields[x] == 1).all()
-
-
-class Objects(Final):
-    def fields(self, problem):
-        return {"things": ((), np.dtype(object))}
-
-
-def test_a_store_takes_numbers(tmp_path):
-    with pytest.raises(TypeError, match="`reduce` returns 'things' of object, and a `store` takes numbers"):
-        sympflow.ensemble(SYSTEM, "verlet", (0, 1), STATES, store=tmp_path / "a", reduce=Objects())
-    with pytest.raises(TypeError, match="`dtype` object is not numeric"):
-        Store.create(tmp_path / "b", {"a": Field(("x",), (2,), object)}, {})
-    assert not os.listdir(tmp_path)

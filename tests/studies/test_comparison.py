@@ -1,16 +1,12 @@
 """compare(): rows, files, and methods matched to each other."""
 
-import csv
-import json
 import math
 
 import numpy as np
 import pytest
 
-from sympflow import HamiltonianSystem, SympFlow, compare, get, reference_error, solve, stability, systems
+from sympflow import HamiltonianSystem, compare, get, reference_error, solve, systems
 from sympflow.metrics.reference import Reference
-from sympflow.studies.attempts import Row, interleaved
-from sympflow.studies.comparison import combined_table, matched
 
 QUICK = {"n_outputs": 50, "repeats": 1}
 
@@ -49,12 +45,6 @@ def test_rows_hold_what_the_metrics_say(report):
     assert len(report.t) == 50
 
 
-def test_metrics_that_were_not_asked_for_are_none():
-    row = compare(systems.pendulum(), ["verlet"], ["energy"], **QUICK).rows[0]
-    assert row.energy_error > 0
-    assert (row.error, row.energy_drift, row.volume_error, row.symplecticity_defect, row.training_time) == (None,) * 5
-
-
 def test_methods_that_do_not_apply_or_fail_are_rows_with_the_reason():
     system = HamiltonianSystem.from_sympy("p**2*(1 + q**2)/2 + q**2/2", y0=[0.5, 0.0], t_span=(0, 5))
     report = compare(system, ["verlet", "sympflow", "rk45"], ["energy", "volume"], **QUICK)
@@ -71,12 +61,6 @@ def test_methods_that_do_not_apply_or_fail_are_rows_with_the_reason():
     assert "non-finite" in unstable.table()
 
 
-def test_a_problem_without_a_reference_still_gets_the_other_metrics():
-    report = compare(systems.henon_heiles(), ["verlet"], y0=[0, 0, 0, 0.7], t_span=(0, 6), **QUICK)
-    assert report.rows[0].status == "failed"
-    assert "no reference converges" in report.rows[0].reason
-
-
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("batch", [False, True], ids=["single", "batch"])
 def test_a_blow_up_is_infinite_in_every_column(batch):
@@ -88,18 +72,6 @@ def test_a_blow_up_is_infinite_in_every_column(batch):
         assert (row.energy_error, row.energy_drift, row.volume_error, row.symplecticity_defect) == (math.inf,) * 4
         assert row.time_reversal_error == math.inf
         assert "encountered" not in row.reason
-
-
-def test_a_flow_in_eager_torch_beside_compiled_methods_says_so():
-    arguments = {"metrics": ["energy", "reversal"], "t_span": (0, 5), **QUICK}
-    mlp, verlet = compare(systems.pendulum(), ["mlp", "verlet"], **arguments).rows
-    assert (mlp.backend, verlet.backend) == ("torch", "compiled")
-    assert "Runs in eager torch, while others run compiled" in mlp.reason
-    assert "No reversal: method 'mlp' cannot run backwards in time." in mlp.reason
-    assert mlp.time_reversal_error is None
-    assert verlet.reason == ""
-    alone = compare(systems.pendulum(), ["mlp", "rk45"], **arguments).rows[0]
-    assert "eager" not in alone.reason
 
 
 def test_a_reference_of_another_problem_is_refused():
@@ -120,79 +92,6 @@ def test_a_reference_of_another_problem_is_refused():
     assert report.reference.accuracy is None
     assert "reference: given, of unknown accuracy" in report.table()
     assert report.to_dict()["reference"] == {"method": "given", "accuracy": None}
-
-
-def test_a_solution_may_be_the_reference():
-    system, t = systems.pendulum(), np.arange(1, 51) / 5
-    truth = solve(system, "kahan_li8", (0, 10), t_eval=t)
-    report = compare(system, ["verlet"], ["error"], t_span=(0, 10), reference=truth, **QUICK)
-    verlet = solve(system, "verlet", (0, 10), t_eval=t)
-    assert report.rows[0].error == reference_error(verlet, truth).max()
-    assert report.reference.method == "given"
-
-
-def test_a_batch_is_summed_up_by_its_median_and_its_worst():
-    system = systems.henon_heiles()
-    y0 = system.domain.sample(5, 0)
-    report = compare(system, ["verlet", "rk45"], y0=y0, t_span=(0, 5), **QUICK)
-    alone = [compare(system, ["rk45"], y0=y, t_span=(0, 5), **QUICK).rows[0] for y in y0]
-    rk45 = report.rows[1]
-    assert rk45.error == pytest.approx(np.median([row.error for row in alone]), rel=1e-6)
-    assert rk45.volume_error == pytest.approx(max((row.volume_error for row in alone), key=abs), rel=1e-9)
-
-
-@pytest.mark.parametrize("what", ["evaluations", "energy_error"])
-def test_methods_are_matched_to_the_first(what):
-    report = compare(systems.pendulum(), ["verlet", "yoshida4", "rk45"], match=what, t_span=(0, 50), **QUICK)
-    cost = [row.force_evaluations if what == "evaluations" else row.energy_error for row in report.rows]
-    assert cost[1] == pytest.approx(cost[0], rel=0.1)
-    assert cost[2] == pytest.approx(cost[0], rel=0.15)
-
-
-def test_matching_finds_the_step_of_a_power_law():
-    system = systems.pendulum()
-    for power, grows in ((2.0, True), (-1.0, False), (6.0, True)):
-        found, value = matched(get("verlet")(dt=0.1), system, lambda m, n=power: m.dt**n, 0.003**power, grows)
-        assert value == pytest.approx(0.003**power, rel=0.05)
-        assert found.dt == pytest.approx(0.003, rel=0.06)
-    found, _ = matched(get("verlet")(dt=1.0), system, lambda m: math.inf if m.dt > 0.5 else m.dt**2, 0.2**2, grows=True)
-    assert found.dt == pytest.approx(0.2, rel=0.05)
-
-
-def test_repeats_are_interleaved():
-    order = []
-    times = interleaved([lambda: order.append("a"), lambda: order.append("b")], 3)
-    assert order == list("ababab")
-    assert len(times) == 2
-
-
-def test_files_hold_every_figure(report, tmp_path):
-    with report.to_csv(tmp_path / "new" / "rows.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    assert [row["label"] for row in rows] == [row.label for row in report.rows]
-    assert float(rows[0]["energy_error"]) == report.rows[0].energy_error
-    assert rows[0]["training_time"] == ""
-    content = json.loads(report.to_json(tmp_path / "rows.json").read_text())
-    assert content["rows"][0]["energy_error"] == report.rows[0].energy_error
-    assert content["reference"]["method"].startswith("Kahan–Li 8")
-
-
-def test_json_is_strict_where_a_run_blew_up(tmp_path):
-    report = compare(systems.harmonic_oscillator(), [get("verlet")(dt=2.1)], ["energy"], t_span=(0, 5000), **QUICK)
-    content = json.loads(report.to_json(tmp_path / "rows.json").read_text(), parse_constant=pytest.fail)
-    assert content["rows"][0]["energy_error"] == "inf"
-
-
-def test_table_fits_the_width_by_turning_round(report):
-    wide = report.table()
-    assert "Hénon–Heiles: t = 0 … 20" in wide
-    assert len([line for line in wide.splitlines() if line.startswith("verlet")]) == 2
-    assert report.table(width=200) == wide
-    upright = report.table(width=100).splitlines()
-    assert upright[2].split() == ["verlet", "rk45", "fine", "kahan_li8", "verlet", "#2"]
-    assert upright[4].startswith("step ")
-    both = combined_table([report, report])
-    assert both.count("Hénon–Heiles  verlet") == 2
 
 
 @pytest.mark.parametrize(
@@ -218,32 +117,6 @@ def test_table_fits_the_width_by_turning_round(report):
 def test_bad_arguments_are_refused_at_once(arguments, message):
     with pytest.raises((ValueError, TypeError), match=message):
         compare(systems.pendulum(), **arguments)
-
-
-def test_writers_name_the_path_that_they_cannot_write(tmp_path):
-    report = compare(systems.harmonic_oscillator(), ["verlet"], metrics=("energy",), t_span=(0, 1), repeats=1)
-    study = stability(systems.harmonic_oscillator(), ["verlet"], steps=[0.1], metrics=("energy",), limits=False)
-    flow = SympFlow(1, hidden=(3,))
-    (tmp_path / "file").write_text("")
-    for write in (report.to_csv, report.to_json, study.to_csv, study.to_json, study.plot, flow.save):
-        ending = "safetensors" if write == flow.save else "png"
-        with pytest.raises(ValueError, match=r"^`path` .* is a folder: name a file"):
-            write(tmp_path)
-        with pytest.raises(ValueError, match=r"^`path` .* cannot be written \(.*\): name a file that can be"):
-            write(tmp_path / "file" / f"below.{ending}")
-        with pytest.raises(TypeError, match=r"^`path` must be"):
-            write(3)
-        write(tmp_path / f"new_{write.__name__}" / "folder" / f"x.{ending}")
-        assert (tmp_path / f"new_{write.__name__}" / "folder" / f"x.{ending}").is_file()
-    with pytest.raises(ValueError, match=r"^`path` 'x.xyz' ends in '.xyz', which is not a format of figures"):
-        study.plot(tmp_path / "x.xyz")
-
-
-def test_the_repr_of_a_row_shows_what_is_filled_in():
-    row = Row("pendulum", "verlet", "verlet", run_time=1.5, figures={"energy_error": 0.0})
-    assert repr(row) == (
-        "Row(system='pendulum', method='verlet', label='verlet', status='ok', run_time=1.5, energy_error=0.0)"
-    )
 
 
 @pytest.mark.parametrize(

@@ -1,18 +1,11 @@
 """work_precision(): sweeps, references, and what is read off the diagram."""
 
 import csv
-import math
-import time
-from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 import pytest
 
-from sympflow import HamiltonianSystem, SympFlow, compare, get, systems, work_precision
-from sympflow.integrators.base import FixedStep
-from sympflow.studies.attempts import Row, warm_up
-from sympflow.studies.precision import break_even, cost_at
+from sympflow import HamiltonianSystem, SympFlow, get, systems, work_precision
 
 pytestmark = pytest.mark.filterwarnings("ignore:`dt` .* is too long:RuntimeWarning")
 
@@ -38,35 +31,11 @@ def test_steps_are_swept_from_coarse_to_the_level_of_rounding(report):
     assert len(points(report, "sympflow")) == 1
 
 
-@pytest.mark.parametrize(("label", "order"), [("verlet", 2), ("kahan_li8", 8)])
-@pytest.mark.parametrize("trajectories", [1, 20])
-def test_errors_fall_with_the_order(report, label, order, trajectories):
-    rows = [r for r in points(report, label, trajectories) if r.status == "ok" and r.dt < 0.5]
-    slope = np.polyfit(np.log([r.dt for r in rows]), np.log([r.error for r in rows]), 1)[0]
-    assert slope == pytest.approx(order, abs=0.6)
-
-
 def test_an_error_is_at_least_a_hundred_times_that_of_the_reference_or_is_marked(report):
     for row in report.rows:
         reference = report.references[row.trajectories > 1]
         if row.error is not None:
             assert (row.status == "uncertain") == (row.error < 100 * reference.accuracy)
-
-
-def test_evaluations_are_those_of_one_trajectory(report):
-    for trajectories in (1, 20):
-        row = next(r for r in points(report, "verlet", trajectories) if r.dt == 0.05)
-        assert row.force_evaluations == 200 + 10  # an output closes a step that was merged with the next
-        assert row.hessian_evaluations == 0
-    alone, batch = points(report, "rk45")[0], points(report, "rk45", 20)[0]
-    assert batch.force_evaluations == pytest.approx(alone.force_evaluations, rel=0.3)
-    assert "Timed on 4 trajectories" in batch.reason
-
-
-def test_force_gradients_are_counted_apart():
-    row = work_precision(systems.pendulum(), ["chin4a"], steps=[0.1], **QUICK).rows[0]
-    assert row.hessian_evaluations == 100
-    assert row.force_evaluations == 200 + 10
 
 
 def test_files_table_and_figure(report, tmp_path):
@@ -82,23 +51,6 @@ def test_files_table_and_figure(report, tmp_path):
     assert (tmp_path / "figure.png").exists()
     with pytest.raises(ValueError, match="`measure` must be one of"):
         report.figure("beauty")
-
-
-def test_cost_is_interpolated_between_points_of_a_power_law():
-    law = [Row("s", "m", "m", run_time=e**-0.5, figures={"energy_error": e}) for e in (1e-2, 1e-4, 1e-6)]
-    assert cost_at(law, 1e-3) == pytest.approx(1e-3**-0.5)
-    assert cost_at(law, 1.0) == pytest.approx(10)  # nothing cheaper is known
-    assert cost_at(law, 1e-7) == math.inf
-
-
-def test_training_has_paid_for_itself_when_the_time_saved_is_that_of_training():
-    rival = [Row("s", "verlet", "verlet", run_time=0.01 / e, figures={"energy_error": e}) for e in (1e-2, 1e-4)]
-    figures = {"energy_error": 1e-3}
-    flow = Row("s", "sympflow", "sympflow", run_time=4.0, training_time=60.0, figures=figures)
-    slow = Row("s", "sympflow", "slow", run_time=40.0, training_time=60.0, figures=figures)
-    *_, quick, never = break_even([*rival, flow, slow], length=100.0)
-    assert quick.break_even == pytest.approx(60 / ((10 - 4) / 100))
-    assert never.break_even == math.inf
 
 
 def test_methods_that_do_not_apply_and_unstable_steps_are_rows():
@@ -137,74 +89,6 @@ def test_methods_that_do_not_apply_and_unstable_steps_are_rows():
 def test_bad_arguments_are_refused_at_once(arguments, message):
     with pytest.raises((ValueError, TypeError), match=message):
         work_precision(systems.pendulum(), ["verlet"], **arguments)
-
-
-def test_a_flow_in_another_time_is_a_point_as_it_is_a_row_of_compare():
-    flow = get("sympflow")(flow="kepler-log-1")
-    few = {"t_span": (0, 20), "n_outputs": 20, "repeats": 1}
-    verlet, point = work_precision(systems.kepler(0.6), ["verlet", flow], steps=[0.05], **few).rows
-    (row,) = compare(systems.kepler(0.6), [flow], ["error", "energy"], dt=0.05, **few).rows
-    assert (point.label, point.status, point.dt) == ("sympflow", "uncertain", row.dt)  # better than the reference
-    assert point.training_time == row.training_time > 0
-    assert point.energy_error == row.energy_error < 1e-6 * verlet.energy_error
-
-
-COMPILING = 0.3  # seconds
-
-
-@dataclass(frozen=True)
-class Cold(FixedStep):
-    """Explicit Euler, "compiled" at its first step of one state, of states in a batch, and of shorter steps."""
-
-    name: ClassVar[str] = "cold"
-    order: ClassVar[int | None] = 1
-    symplectic: ClassVar[bool] = False
-    ready: ClassVar[set[tuple[int, int]]] = set()
-
-    def step(self, system, t, y, h):
-        kind = (y.ndim, np.ndim(h))
-        if kind not in self.ready:
-            time.sleep(COMPILING)
-            self.ready.add(kind)
-        return y + np.asarray(h)[..., None] * system.vector_field(y)
-
-
-@pytest.mark.parametrize("budget", [20.0, 0.0])
-def test_compiling_is_no_run_time(budget):
-    """Without repeats the first run of a point counts; the outputs at 1/3, 2/3, 1 need shorter steps as well."""
-    Cold.ready.clear()
-    few = {"t_span": (0, 1), "n_outputs": 3, "repeats": 1, "budget": budget}
-    report = work_precision(systems.pendulum(), [("cold", Cold(dt=0.5))], batch=5, **few)
-    assert all(row.run_time < COMPILING / 3 for row in report.rows)
-    assert all(row.compile_time > 0.9 * COMPILING for row in report.rows)
-    assert "compiled in" in report.table()
-    again = work_precision(systems.pendulum(), [("cold", Cold(dt=0.5))], **few)
-    assert all(row.compile_time < COMPILING / 3 for row in again.rows)
-    assert "compiled in" not in again.table()
-    Cold.ready.clear()
-    (row,) = compare(systems.pendulum(), [Cold(dt=0.5)], ["energy"], t_span=(0, 1), n_outputs=3, repeats=1).rows
-    assert row.run_time < COMPILING / 3 < 0.9 * COMPILING < row.compile_time
-
-
-def test_a_warm_up_is_a_run_of_a_few_steps_with_as_many_outputs():
-    runs = []
-    warm_up(lambda span, t: runs.append((span, t)), 0.1, np.linspace(0.1, 100.0, 1000), 0.0)
-    warm_up(lambda span, t: runs.append((span, t)), 0.1, np.linspace(-0.01, -0.1, 10), 0.0)
-    for (t0, t1), t in runs:
-        assert t0 == 0
-        assert t[-1] == t1
-        assert np.all(np.diff(t) * t1 > 0)
-    assert [len(t) for _, t in runs] == [1000, 1000, 10, 10]
-    assert runs[0][0][1] == pytest.approx(0.35)
-    assert runs[2][0][1] == -0.1
-
-
-def test_an_error_that_would_be_small_by_chance_is_measured():
-    """At dt·ω = 2 Verlet turns an oscillator at rest by half a turn: all its steps have its energy but for rounding."""
-    few = {"t_span": (0, 20 / 1.3), "y0": [1.0, 0.0], "n_outputs": 10, "repeats": 1}
-    rows = work_precision(systems.harmonic_oscillator(1.3), ["verlet"], steps=[2 / 1.3, 0.4, 0.1], **few).rows
-    assert [row.dt for row in rows] == [2 / 1.3, 0.4, 0.1]
-    assert 1e-3 < rows[2].energy_error < rows[1].energy_error < rows[0].energy_error
 
 
 def test_a_driven_system_is_judged_by_its_energy_balance_and_a_damped_one_by_its_state(tmp_path):

@@ -1,24 +1,14 @@
 """stability(): the limits that are known, blow-ups told apart, and what is refused."""
 
-import csv
-import json
-import math
 import re
-from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 import pytest
 import torch
-from typer.testing import CliRunner
 
 import sympflow
-from sympflow import HamiltonianSystem, max_energy_error, solve, stability, systems
-from sympflow.commands import app
-from sympflow.integrators.base import FixedStep
-from sympflow.metrics.linear_stability import small_oscillations
-from sympflow.studies.attempts import candidates
-from sympflow.studies.step_stability import Search, Study, blow_up, initial_states
+from sympflow import HamiltonianSystem, solve, stability, systems
+from sympflow.studies.step_stability import blow_up
 
 pytestmark = pytest.mark.filterwarnings("ignore:`dt` .* is too long:RuntimeWarning")
 
@@ -47,71 +37,6 @@ def test_the_first_loss_of_stability_is_found_whatever_the_steps(method, first):
     assert found[0].frequency == pytest.approx(3)
 
 
-@pytest.mark.parametrize(
-    "method", ["srkn6b", *(pytest.param(m, marks=pytest.mark.slow) for m in ("kahan_li8", "gauss_legendre4"))]
-)
-def test_the_limit_of_a_nonlinear_system_does_not_depend_on_the_steps(method):
-    few = {"metrics": ("energy",), "max_steps": 5000, "min_steps": 200, "t_span": (0.0, 20.0)}
-    limits = {
-        stability(systems.henon_heiles(), [method], steps=steps, **few).limits[0].stable
-        for steps in ([0.05], [0.31, 0.32], [0.06, 7.0])
-    }
-    assert len(limits) == 1
-
-
-def test_windows_below_the_limit_are_named_where_the_runs_bear_them():
-    """Near its equilibrium the pendulum grows by kahan_li8 at dt = 3.12, to 1e2 times its energy and no more."""
-    few = {"steps": [0.5], "metrics": ("energy",), "max_steps": 5000, "min_steps": 500}
-    (limit,) = stability(systems.pendulum(), ["kahan_li8"], y0=[0.01, 0.01], **few).limits
-    assert limit.stable > 4
-    assert limit.linear == pytest.approx(3.0964, abs=1e-4)
-    assert limit.reached == "below the bound, though small oscillations grow at 3.0964 to 3.1402"
-
-
-def test_every_window_is_tried_near_both_ends():
-    """In Morse's potential, ω = 3, kahan_li8 grows from 1.032 to 1.0467, and dissociates at 1.046 alone."""
-    system, start = systems.pendulum(), np.array([[0.01, 0.01]])
-    study = Study(
-        *(system, candidates(["kahan_li8"])[0], "float64", (0.0, 20.0)),
-        *(start, (), 1e3, 200, 5000),
-        small=small_oscillations(system, start[0], lambda: start),
-    )
-    start, stop, _ = study.linear.windows[0]
-    tried = [h for h in Search(study, [])._in_windows() if start < h < stop]
-    assert len(tried) == 4
-    assert tried[0] - start < 0.2 * (stop - start)
-    assert stop - tried[-1] < 0.02 * (stop - start)
-
-
-def test_an_unstable_step_that_was_asked_for_lowers_the_limit():
-    study = Study(
-        *(systems.pendulum(), candidates(["verlet"])[0], "float64", (0.0, 20.0)),
-        *(systems.pendulum().y0[None], (), 1e3, 200, 5000),
-    )
-    low, high, _ = Search(study, []).limit()
-    lower, bad, _ = Search(study, [0.3]).limit()
-    assert low > 1
-    assert 0.29 < lower < bad <= 0.3 < low < high
-
-
-def test_a_row_inside_a_window_says_so():
-    oscillator = systems.harmonic_oscillator()
-    (row,) = stability(oscillator, ["srkn14a"], steps=[3.1415], metrics=("energy",), max_steps=1000).rows
-    assert row.status == "bounded"  # a factor 1.0006 a step, in 1000 of them
-    assert row.reason.endswith("Small oscillations are unstable here: they grow by up to a factor 1.0006 a step.")
-
-
-def test_two_is_unstable_though_one_state_does_not_show_it():
-    oscillator = systems.harmonic_oscillator()
-    alone = solve(oscillator, "verlet", (0.0, 2e3), dt=2.0)
-    assert sympflow.max_energy_error(alone) == 0
-    kinds = {}
-    for z in (1.98, 2.0, 2.02):
-        report = stability(oscillator, ["verlet"], steps=[z], metrics=("energy",), limits=False)
-        kinds[z] = report.rows[0].status
-    assert kinds == {1.98: "bounded", 2.0: "unstable", 2.02: "unstable"}
-
-
 def test_an_overflow_is_never_a_small_error():
     (row,) = stability(systems.harmonic_oscillator(), ["verlet"], steps=[2.5], metrics=("energy",), limits=False).rows
     assert row.status == "unstable"
@@ -138,68 +63,6 @@ def test_a_singularity_is_found_within_a_step(method, dt):
     assert f"becomes infinite, at about t = {end.time:.10g}" in sol.message
 
 
-@pytest.mark.parametrize(
-    ("method", "options"), [("verlet", {"dt": 0.5}), ("implicit_midpoint", {"dt": 0.5}), ("rk45", {}), ("dop853", {})]
-)
-def test_a_singularity_is_found_whatever_the_step_or_the_tolerance(method, options):
-    system = systems.henon_heiles_escape()
-    end = blow_up(solve(system, method, (0.0, 20.0), on_domain_exit="ignore", **options))
-    assert end.singular
-    assert abs(end.time - SINGULARITY) < 1e-8
-    assert "grows" not in str(end)
-
-
-def test_an_unstable_step_of_a_system_without_singularities_is_not_taken_for_one():
-    system = systems.fput(50.0)  # quartic, so that the growth is faster than by a constant factor
-    sol = solve(system, "verlet", (0.0, 50.0), dt=0.06, on_domain_exit="ignore")
-    assert sol.status == -1
-    end = blow_up(sol)
-    assert not end.singular
-    assert end.time == sol.stats["failed_at"]
-    assert "blow_up_time" not in sol.stats
-    assert sol.message.endswith("The solution itself goes on there: it takes shorter steps.")
-
-
-@pytest.mark.parametrize(
-    ("method", "options"),
-    [
-        *(("verlet", options) for options in ({}, {"t_eval": [9.0]}, {"backend": "array"}, {"dense_output": True})),
-        *(("rk45", {}), ("rk45", {"dense_output": True})),
-    ],
-)
-def test_each_trajectory_of_a_batch_has_its_blow_up_time(method, options):
-    """Both ways in time, whatever is asked for: the estimate is that of the trajectory alone."""
-    system = systems.henon_heiles()
-    y0 = np.array([[0, 0, 0, 0.7], system.y0, [0, 0, 0, 0.71]])
-    sol = solve(system, method, (0, 9), y0, **options)
-    assert sol.status.tolist() == [-1, 0, -1]
-    times = sol.stats["blow_up_time"]
-    assert np.isnan(times[1])
-    assert abs(times[0] - SINGULARITY) < 1e-8
-    alone = solve(system, method, (0, 9), y0[2], **options)
-    assert abs(alone.stats["blow_up_time"] - times[2]) < 1e-8
-    assert "The solution of trajectory 0 itself becomes infinite" in sol.message
-    y0[:, 2:] *= -1  # time runs backwards
-    back = solve(system, method, (9, 0), y0, **{**options, "t_eval": [0.0]})
-    np.testing.assert_allclose(9 - back.stats["blow_up_time"], times, rtol=0, atol=1e-8)
-
-
-def test_an_escape_after_a_long_run_is_that_of_the_orbit_that_ran():
-    """Too far for the solution from y0: it is followed from a state that the run has stored, or reaches once more."""
-    system = systems.henon_heiles_escape(1 / 6 + 1e-3)
-    # Orbits near a chaotic one: when each of them escapes depends on the rounding, that some do so late does not.
-    y0 = np.array([0.138, 0.04, 0.554, -0.076]) * (1 + 1e-6 * np.arange(16)[:, None])
-    for options in ({}, {"t_eval": [1e4]}):
-        sol = solve(system, "kahan_li8", (0, 1e4), y0, dt=0.1, **options)
-        late = sol.stats["failed_at"] > 1000
-        assert late.any()
-        assert np.abs(sol.stats["blow_up_time"] - sol.stats["failed_at"])[late].max() < 2 * 0.1
-    for options in ({"t_eval": [1e4]}, {"save_every": 999}):
-        runs = (solve(system, "kahan_li8", (0, 1e4), start, dt=0.1, **options) for start in y0)
-        stats = next(sol.stats for sol in runs if sol.stats.get("failed_at", 0) > 1000)
-        assert abs(stats["blow_up_time"] - stats["failed_at"]) < 2 * 0.1
-
-
 def test_what_is_no_singularity_is_not_called_one():
     """A step beyond the limit, a force that ends, a collision that p survives, and one that it does not."""
     unstable = solve(systems.harmonic_oscillator(), "verlet", (0, 1e4), dt=2.01)
@@ -215,20 +78,6 @@ def test_what_is_no_singularity_is_not_called_one():
     assert "blow_up_time" not in well.stats
 
 
-def test_rows_of_a_singular_solution():
-    report = stability(
-        systems.henon_heiles_escape(), ["kahan_li8", "rk45"], steps=[0.1], t_span=(0, 20), metrics=("energy", "domain")
-    )
-    fixed, adaptive = report.rows
-    assert fixed.status == adaptive.status == "unstable"
-    assert fixed.singular
-    assert abs(fixed.blow_up - SINGULARITY) < 0.1
-    assert abs(adaptive.blow_up - SINGULARITY) < 0.1
-    assert fixed.domain_exit < SINGULARITY
-    assert report.limits[0].stable is None
-    assert "singular" in report.limits[0].reached
-
-
 def test_a_flow_outside_its_domain_is_not_called_stable():
     """The solution does not exist beyond t*; the flow goes on, finite and wrong, outside Ω."""
     arguments = {"steps": [0.1], "t_span": (0.0, 20.0), "y0": [[0.0, 0.0, 0.0, 0.7]], "min_steps": 1}
@@ -239,68 +88,6 @@ def test_a_flow_outside_its_domain_is_not_called_stable():
     assert re.search(r"Left the flow's domain at t = [\d.]+, where the flow says nothing\.", row.reason)
     assert limit.stable is None
     assert limit.reached == "none: the solution leaves the flow's domain"
-
-
-def test_an_energy_error_above_one_is_bounded_rather_than_stable():
-    oscillator = systems.harmonic_oscillator()
-    (row,) = stability(oscillator, ["leapfrog"], steps=[1.99], metrics=("energy",), limits=False).rows
-    assert row.status == "bounded"
-    assert row.energy_error > 1  # (z²/4)/(1 − z²/4) is 99
-    assert "but reaches" in row.reason
-
-
-def test_initial_states_lie_on_one_orbit():
-    system = systems.kepler(0.9)
-    states = initial_states(system, None)
-    assert states.shape == (4, 4)
-    np.testing.assert_array_equal(states[0], system.y0)
-    np.testing.assert_allclose(system.hamiltonian(states), -0.5, rtol=1e-8)
-    given = np.ones((3, 4))
-    np.testing.assert_array_equal(initial_states(system, given), given)
-
-
-@pytest.mark.parametrize(
-    ("method", "span"),
-    [
-        ("verlet", {}),
-        pytest.param(
-            "gauss_legendre4",
-            {"t_span": (0.0, 20.0), "min_steps": 200},
-            marks=pytest.mark.slow,  # by arrays: dear
-        ),
-    ],
-)
-def test_both_precisions_and_every_metric(tmp_path, method, span):
-    report = stability(systems.pendulum(), [method], steps=[0.1], dtypes=["float64", "float32"], **span)
-    double, single = report.rows
-    assert (double.dtype, single.dtype) == ("float64", "float32")
-    assert double.symplecticity_defect < 1e-14 < single.symplecticity_defect < 1e-5
-    assert double.volume_error < 1e-12 < single.volume_error < 1e-3
-    assert double.status == single.status == "stable"
-    assert abs(double.energy_drift) < 5 * double.energy_drift_error + 1e-9
-    path = report.to_csv(tmp_path / "rows.csv")
-    with path.open() as file:
-        rows = list(csv.DictReader(file))
-    assert [float(row["energy_error"]) for row in rows] == [row.energy_error for row in report.rows]
-    assert "longest stable step" in report.table()
-
-
-def test_a_flow_is_run_up_to_its_dt_and_refused_beyond():
-    report = stability(systems.pendulum(), ["sympflow"], metrics=("energy", "domain"))
-    dt = solve(systems.pendulum(), "sympflow", (0, 1)).stats["dt"]
-    assert [row.dt for row in report.rows] == [dt / 4, dt / 2, dt]
-    assert report.limits[0].stable == dt
-    assert report.limits[0].reached == "all up to the flow's Δt"
-    (row,) = stability(systems.pendulum(), ["sympflow"], steps=[2 * dt]).rows
-    assert row.status == "not applicable"
-    assert row.reason.startswith("`dt` must be at most the flow's Δt")
-
-
-def test_what_does_not_apply_is_a_row_with_its_reason():
-    report = stability(systems.nonseparable(), ["verlet", "implicit_midpoint"], steps=[0.05], metrics=("energy",))
-    assert [row.status for row in report.rows] == ["not applicable", "stable"]
-    assert "is not" in report.rows[0].reason
-    assert [limit.label for limit in report.limits] == ["implicit_midpoint"]
 
 
 def test_a_map_of_a_family(tmp_path):
@@ -354,21 +141,6 @@ def test_bad_arguments(arguments, message):
         stability([1], ["verlet"])
 
 
-def test_the_command(tmp_path):
-    pytest.importorskip("matplotlib")
-    words = ["stability", "harmonic-oscillator", "--vary", "omega=1,1000", "--methods", "verlet", "--metrics", "energy"]
-    result = CliRunner().invoke(app, [*words, "--out", str(tmp_path)])
-    assert result.exit_code == 0, result.output
-    assert result.output.count("harmonic oscillator, ω = 1000  verlet") >= 1
-    assert {p.name for p in tmp_path.iterdir()} == {
-        "harmonic-oscillator-stability.csv",
-        "harmonic-oscillator-stability.png",
-    }
-    result = CliRunner().invoke(app, ["stability", "pendulum", "--vary", "omega=1"])
-    assert result.exit_code == 2
-    assert "which is not a parameter of pendulum" in result.output
-
-
 def test_a_limit_that_is_not_found_is_explained_and_progress_names_every_step():
     said, methods = [], ["verlet", "impulse", "rk45"]
     family = [systems.harmonic_oscillator(w) for w in (1.0, 2.0)]
@@ -385,68 +157,3 @@ def test_a_limit_that_is_not_found_is_explained_and_progress_names_every_step():
         "ω = 1: verlet, float64, longest stable step: dt",
     ):
         assert any(text in line for line in said)
-
-
-def test_the_bound_is_missed_where_the_orbit_of_the_map_has_a_short_period():
-    """Verlet's step turns the oscillator by θ, cos θ = 1 − z²/2: for θ = 2π/n the error is max_k sin²(kθ)·z²/4."""
-    for n in (3, 5, 6, 7, 8):
-        z = 2 * math.sin(math.pi / n)
-        sol = solve(systems.harmonic_oscillator(), "verlet", (0.0, 100 * n * z), [1.0, 0.0], dt=z)
-        share = max(math.sin(2 * math.pi * k / n) ** 2 for k in range(n))
-        assert max_energy_error(sol) == pytest.approx(share * z**2 / 4, rel=1e-10)
-
-
-@dataclass(frozen=True)
-class Breaking(FixedStep):
-    """Explicit Euler whose step breaks where it is long."""
-
-    name: ClassVar[str] = "breaking"
-    order: ClassVar[int | None] = 1
-    symplectic: ClassVar[bool] = False
-
-    def step(self, system, t, y, h):
-        if np.max(np.abs(h)) > 0.1:
-            raise KeyError("no table")
-        return y + np.asarray(h)[..., None] * system.vector_field(y)
-
-
-def test_a_method_that_breaks_is_a_row_and_so_are_the_others():
-    few = {"min_steps": 20, "max_steps": 4000, "metrics": ("energy",)}
-    report = stability(systems.pendulum(), [Breaking(), "verlet"], steps=[0.01, 0.2], t_span=(0, 1), **few)
-    assert [row.status for row in report.rows] == ["stable", "failed", "stable", "stable"]
-    assert report.rows[1].reason == "KeyError: 'no table'"
-    assert 0.09 < report.limits[0].stable <= 0.1 < report.limits[0].unstable
-    (row,) = stability(systems.pendulum(), [Breaking()], steps=[0.2], **few).rows
-    assert row.status == "failed"
-
-
-def test_a_warning_of_a_metric_is_a_note():
-    rest = [[0.0, 0.0]]  # of no energy
-    (row,) = stability(systems.harmonic_oscillator(), ["verlet"], steps=[0.1], y0=rest, limits=False).rows
-    assert row.reason.startswith("The energy error is absolute where all terms of H are 0")
-    assert row.reason.count("absolute") == 1
-
-
-def test_json_holds_the_rows_and_the_limits(tmp_path):
-    report = stability(systems.harmonic_oscillator(), ["verlet"], steps=[1.0, 3.0], metrics=("energy",))
-    content = json.loads(report.to_json(tmp_path / "x.json").read_text(), parse_constant=pytest.fail)
-    assert content["systems"] == [{"name": "harmonic_oscillator", "params": {"omega": 1.0}}]
-    assert [row["status"] for row in content["rows"]] == ["stable", "unstable"]
-    assert content["rows"][1]["energy_error"] == "inf"
-    assert content["limits"][0]["stable"] == report.limits[0].stable
-
-
-def test_a_flow_in_another_time_is_run_at_fractions_of_its_own_step():
-    flow = sympflow.get("sympflow")(flow="kepler-log-1")
-    report = stability(systems.kepler(0.6), [flow], metrics=("energy",), min_steps=20, max_steps=200)
-    dt = solve(systems.kepler(0.6), flow, (0, 1)).stats["dt"]
-    assert [(row.dt, row.status) for row in report.rows] == [(dt * f, "stable") for f in (0.25, 0.5, 1.0)]
-    assert report.limits[0].stable == dt
-
-
-def test_a_system_of_plain_functions_takes_the_steps_of_arrays():
-    """Its methods run by array operations, which are 200 times as slow: at most max_steps/200 steps."""
-    plain = HamiltonianSystem(lambda q: 2 * (q**2).sum(-1), ndof=1, y0=[1.0, 0.0], dt=0.05)
-    report = stability(plain, ["verlet"], steps=[0.1], metrics=("energy",), min_steps=50, max_steps=10_000)
-    assert report.rows[0].n_steps == 50
-    assert report.limits[0].stable == pytest.approx(1.0)  # 2/ω at ω = 2

@@ -1,18 +1,14 @@
 """The driven scenes: the truths that their docstrings tell."""
 
 import math
-import warnings
 
 import numpy as np
 import pytest
-import sympy as sp
-from conftest import load_example
-from scipy.interpolate import CubicSpline, PPoly
-from scipy.special import mathieu_a, mathieu_b, mathieu_cem
+from conftest import refusals
+from scipy.special import mathieu_a, mathieu_b
 
-from sympflow import HamiltonianSystem, energy_balance_error, floquet_multipliers, solve, systems
+from sympflow import floquet_multipliers, solve, systems
 from sympflow.hamiltonian.domain import domain_from_dict
-from sympflow.hamiltonian.driving import Samples
 
 SCENES = {name: systems.get(name)() for name in ("driven-pendulum", "paul-trap", "duffing", "fodo-cell", "kicked")}
 
@@ -47,111 +43,11 @@ def test_small_deviations_of_the_driven_pendulum_follow_mathieu(upright, drive):
     assert np.trace(found.monodromy) == pytest.approx(2 if upright else -2, abs=1e-9)
 
 
-def test_the_paul_trap_holds_the_ion_up_to_the_first_boundary():
-    """q = 0.9080463337 at a = 0, where b₁(q) = 0, by bisection; the tip of the region where both planes are stable."""
-    trap, low, high = SCENES["paul-trap"], 0.9, 0.92
-    while high - low > 1e-5:
-        q = (low + high) / 2
-        stable = floquet_multipliers(trap.with_params(drive=q), np.zeros(4)).stable
-        low, high = (q, high) if stable else (low, q)
-    assert low == pytest.approx(0.9080463337, abs=2e-5)
-    assert mathieu_b(1, 0.9080463337) == pytest.approx(0.0, abs=1e-9)
-    for a, stable in ((0.2365, True), (0.2375, False)):
-        assert floquet_multipliers(systems.paul_trap(a, 0.7060), np.zeros(4)).stable is stable
-
-
-def test_a_periodic_orbit_of_the_paul_trap_is_a_mathieu_function():
-    q, t = 0.4, np.linspace(0, 10, 6)
-    system = systems.paul_trap(float(mathieu_a(0, q)), q)
-    exact = mathieu_cem(0, q, np.degrees(t))[0]
-    sol = solve(system, "kahan_li8", (0, 10), [exact[0], 0, 0, 0], t_eval=t, backend="array")
-    np.testing.assert_allclose(sol.y[0], exact, atol=1e-12)
-
-
-def test_the_multipliers_of_duffings_oscillator_have_the_product_of_the_friction():
-    """An orbit of the period of the drive, found by Newton's method, by 60 steps a period."""
-    system, y = SCENES["duffing"], np.array([-0.148, 0.018])  # of the linear equation
-    T, dt = system.period, system.period / 60
-    for _ in range(8):
-        end = solve(system, "kahan_li8", (0, T), y, dt=dt, t_eval=[T], backend="array").y[:, -1]
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # not periodic yet
-            M = floquet_multipliers(system, y, dt=dt).monodromy
-        y = y - np.linalg.solve(M - np.eye(2), end - y)
-    found = floquet_multipliers(system, y, dt=dt)
-    assert found.mismatch < 1e-10
-    assert not found.stable  # it is part of the strange attractor
-    assert np.prod(found.multipliers).real == pytest.approx(math.exp(-0.25 * T), rel=1e-10)
-    assert found.pairing < 1e-13
-    assert systems.duffing(damping=0).conservative
-
-
 def cell(system, method, **options):
     """The matrices of a cell, (2, 2, 2), by the solutions from unit vectors."""
     sol = solve(system, method, (0, system.period), np.eye(4), t_eval=[system.period], backend="array", **options)
     M = sol.y[..., -1].T
     return np.stack([M[np.ix_(i, i)] for i in ([0, 2], [1, 3])])
-
-
-@pytest.mark.parametrize(("method", "order"), [("leapfrog", 2), ("chin4c", 4), ("gauss_legendre4", 4), ("verlet", 2)])
-def test_order_in_a_lattice_whose_steps_meet_the_jumps(method, order):
-    system, exact = SCENES["fodo-cell"], systems.fodo_matrices()
-    errors = [np.abs(cell(system, method, dt=system.dt / n) - exact).max() for n in (1, 2)]
-    assert math.log2(errors[0] / errors[1]) == pytest.approx(order, abs=0.1)
-
-
-def test_adaptive_methods_do_not_step_over_a_quadrupole():
-    """In a drift their steps would grow beyond its length: no longer than between two jumps, at any tolerance."""
-    system, exact = SCENES["fodo-cell"], systems.fodo_matrices()
-    assert system.shortest_piece == 0.5
-    assert SCENES["duffing"].shortest_piece == math.inf
-    for method in ("dop853", "rk45", "dopri5"):
-        sol = solve(system, method, (0, system.period), [1.0, 0, 0, 0], t_eval=[system.period], rtol=1e-6)
-        assert np.abs(sol.y[[0, 2], -1] - exact[0, :, 0]).max() < 0.01
-    with pytest.raises(ValueError, match=r"^`sol` is of 'fodo_cell', whose H jumps .* use sympflow.reference_error"):
-        energy_balance_error(sol)
-
-
-def test_runs_land_on_jumps_within_their_steps():
-    cell = SCENES["fodo-cell"]
-    t = sp.Symbol("t", real=True)
-
-    def system(drive, **scene):
-        q, p = sp.symbols("q p", real=True)
-        return HamiltonianSystem.from_sympy(p**2 / 2 + q**2 / 2 - q * drive, time="t", y0=[0.5, 0.1], **scene)
-
-    switched = system(sp.Piecewise((0, t < 1.2), (1, True)))
-    waves = system(sp.sign(sp.cos(t)))
-    ramp = system((t - 1.2) * sp.Heaviside(t - 1.2))
-    for each, t0, dt in (
-        (cell, 0.0, 0.2),
-        (cell, 0.06, cell.dt),
-        (switched, 0.0, 0.3),
-        (switched, 0.2, 0.25),
-        (waves, 0.0, 0.1),
-        (waves, 2.0, -0.1),
-        (waves, -math.pi / 2, math.pi / 14),
-    ):
-        span = t0, t0 + math.copysign(2.0, dt)
-        found, finer = (
-            solve(each, "gauss_legendre8", span, dt=h, t_eval=[span[1]], backend="array").y
-            for h in (abs(dt), abs(dt) / 2)
-        )
-        np.testing.assert_allclose(found, finer, rtol=1e-8)
-    solve(ramp, "kahan_li8", (0.0, 2.0), dt=0.5, backend="array")  # of a kink there is no word
-    with pytest.raises(ValueError, match="jumps at some times"):
-        energy_balance_error(solve(switched, "leapfrog", (0, 2), dt=0.4, backend="array"))
-    solve(switched, "dop853", (0.0, 2.0))  # its steps are its own
-
-
-def test_jumps_of_samples():
-    step = PPoly([[1.0, 2.0, 2.0]], [0.0, 1.0, 3.0, 4.0])
-    for how, jumps, shortest in ((True, [1.0], 1.0), ("periodic", [1.0, 4.0], 1.0)):
-        samples = Samples.of("K", PPoly(step.c, step.x, extrapolate=how))
-        assert samples.jumps.tolist() == jumps
-        assert samples.shortest_piece == shortest
-    smooth = Samples.of("K", CubicSpline(np.arange(6.0), np.sin(np.arange(6.0))))
-    assert len(smooth.jumps) == 0
 
 
 def test_the_matrices_of_the_lattice():
@@ -176,29 +72,12 @@ def test_steps_of_the_kicked_scene_are_the_standard_map():
             p += K * math.sin(q)
 
 
-@pytest.mark.parametrize(
-    ("make", "words"),
-    [
-        (lambda: systems.driven_pendulum(-1.0), r"^`amplitude` must be positive"),
-        (lambda: systems.duffing(force=0), r"^`force` must not be 0"),
-        (lambda: systems.driven_pendulum(0.1, 0.0), r"^`frequency` must be positive"),
-        (lambda: systems.paul_trap(0.0, math.nan), r"^`q` must be a finite number"),
-        (lambda: systems.duffing(damping=-0.1), r"^`damping` must be"),
-        (lambda: systems.fodo_cell(quadrupole=1 / 3), r"^`drift` 2.0 and half the `quadrupole` .* multiple"),
-        (lambda: systems.kicked(modes=0), r"^`modes` must be a whole number"),
-    ],
+test_bad_parameters = refusals(
+    (lambda: systems.driven_pendulum(-1.0), r"^`amplitude` must be positive"),
+    (lambda: systems.duffing(force=0), r"^`force` must not be 0"),
+    (lambda: systems.driven_pendulum(0.1, 0.0), r"^`frequency` must be positive"),
+    (lambda: systems.paul_trap(0.0, math.nan), r"^`q` must be a finite number"),
+    (lambda: systems.duffing(damping=-0.1), r"^`damping` must be"),
+    (lambda: systems.fodo_cell(quadrupole=1 / 3), r"^`drift` 2.0 and half the `quadrupole` .* multiple"),
+    (lambda: systems.kicked(modes=0), r"^`modes` must be a whole number"),
 )
-def test_bad_parameters(make, words):
-    with pytest.raises(ValueError, match=words):
-        make()
-
-
-@pytest.mark.slow
-def test_the_pictures_are_drawn(tmp_path, capsys):
-    load_example("driven_maps").main(["--quick", "--out", str(tmp_path)])
-    assert "Duffing: 620 states" in capsys.readouterr().out
-    assert {p.stem for p in tmp_path.glob("*.png")} == {
-        "duffing_attractor",
-        "driven_pendulum_section",
-        "mathieu_stability",
-    }

@@ -53,26 +53,6 @@ def test_scenes_of_plugins_are_listed_and_made(announced):
 
 
 @pytest.mark.filterwarnings("ignore:The system 'henon_heiles'")
-def test_the_command_line_knows_them(announced, capsys):
-    pytest.importorskip("typer")
-    from typer.testing import CliRunner
-
-    from sympflow.commands import app
-
-    listed = CliRunner().invoke(app, ["systems"], terminal_width=300)
-    assert listed.exit_code == 0
-    assert "strength = 0.1, times = 1" in listed.output
-    assert "`system` 'absent' of the plug-in" in listed.output
-    words = ["solve", "anharmonic-well:strength=0.2:times=2", "--method", "dop853", "--t-end", "1"]
-    solved = CliRunner().invoke(app, words)
-    assert solved.exit_code == 0, solved.output
-    for name, message in (("three", "makes no HamiltonianSystem but a int"), ("absent", "cannot be loaded")):
-        broken = CliRunner().invoke(app, ["solve", name])
-        assert broken.exit_code != 0
-        assert message in broken.output
-
-
-@pytest.mark.filterwarnings("ignore:The system 'henon_heiles'")
 def test_registered_scenes_are_known(announced):
     systems.register("my_well", anharmonic)
     assert "my-well" in systems.available()

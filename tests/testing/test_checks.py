@@ -6,6 +6,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 import torch
+from conftest import refusals
 
 from sympflow import HamiltonianSystem, available, get, systems
 from sympflow.arrays import concatenate, like, per_state, to_numpy
@@ -396,19 +397,6 @@ def test_the_order_with_a_drive_or_friction_is_measured():
         check["friction_is_in_the_steps"](HalfFriction(dt=0.01))
 
 
-@pytest.mark.parametrize(
-    ("name", "liar", "message"),
-    [
-        ("the_start_time_does_not_matter", unsound(step=clock_in_the_step), "a run from t0 = 5.25 differs"),
-        ("states_within_a_step_belong_to_it", unsound(stepper=euler_within_steps), "not the shorter step"),
-        ("what_is_not_finite_stays_so", lying(step=hides_nan), "a step from nan is finite"),
-    ],
-)
-def test_a_lie_that_several_checks_see_is_seen_by_each(name, liar, message):
-    with pytest.raises(AssertionError, match=rf"^{name} of .*{message}"):
-        {check.name: check for check in CHECKS}[name](liar())
-
-
 def test_what_does_not_apply_is_skipped_with_the_reason():
     names, cases = parametrize_with_checks([get("rk4")]).args
     assert names == ("integrator", "check")
@@ -424,31 +412,15 @@ def test_what_does_not_apply_is_skipped_with_the_reason():
     assert skipped["rk4-the_inverse_undoes_the_step"].startswith("`method` 'rk4' has no exact inverse")
 
 
-def test_one_method_with_several_options_has_several_ids():
-    _, cases = parametrize_with_checks([get("verlet"), lambda: get("verlet")(dt=0.01), get("rk4")]).args
-    assert len({case.id for case in cases}) == 3 * len(CHECKS)
-    assert any("dt=0.01" in case.id for case in cases)
-    assert any(case.id.startswith("rk4-") for case in cases)
+NAMELESS = type("Nameless", (FixedStep,), {})
+PRODUCT = HamiltonianSystem.from_sympy("(p**2 + 1)*(q**2 + 1)/2", y0=[0.1, 0.2])
 
-
-def test_a_class_without_a_name_is_refused():
-    nameless = type("Nameless", (FixedStep,), {})
-    with pytest.raises(TypeError, match=r"^`factory` made a Nameless without `name`: set that class attribute"):
-        parametrize_with_checks([nameless])
-
-
-def test_a_method_that_does_not_apply_to_the_system_is_refused():
-    with pytest.raises(ValueError, match=r"^`method` 'verlet' needs a separable system"):
-        check_integrator(get("verlet"), HamiltonianSystem.from_sympy("(p**2 + 1)*(q**2 + 1)/2", y0=[0.1, 0.2]))
-    for system, has in ((systems.damped_pendulum(), "has friction"), (systems.driven_pendulum(), "is driven")):
-        with pytest.raises(ValueError, match=rf"^`system` .* {has}, .*: leave `system` out"):
-            check_integrator(get("verlet"), system)
-
-
-def test_what_makes_no_integrator_is_refused():
-    with pytest.raises(TypeError, match=r"^`factory` must make an Integrator; it made int"):
-        check_integrator(lambda: 3)
-    with pytest.raises(TypeError, match=r"^`factory` must be an integrator's class, .* got a str"):
-        check_integrator("verlet")
-    with pytest.raises(TypeError, match=r"^`system` must be a HamiltonianSystem; got str"):
-        check_integrator(get("verlet"), "henon_heiles")
+test_refusals = refusals(
+    (lambda: check_integrator(lambda: 3), TypeError, "^`factory` must make an Integrator; it made int"),
+    (lambda: check_integrator("verlet"), TypeError, "^`factory` must be an integrator's class, .* got a str"),
+    (lambda: check_integrator(Verlet, "henon_heiles"), TypeError, "^`system` must be a HamiltonianSystem; got str"),
+    (lambda: check_integrator(Verlet, PRODUCT), "^`method` 'verlet' needs a separable system"),
+    (lambda: check_integrator(Verlet, systems.damped_pendulum()), "has friction, .*: leave `system` out"),
+    (lambda: check_integrator(Verlet, systems.driven_pendulum()), "is driven, .*: leave `system` out"),
+    (lambda: parametrize_with_checks([NAMELESS]), TypeError, "^`factory` made a Nameless without `name`: set that"),
+)

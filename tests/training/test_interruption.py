@@ -1,11 +1,8 @@
 """Early ends of a search for a primed flow: Ctrl-C, at any moment, and a time budget, which counts all of it."""
 
-import math
 import os
 import signal
 import sys
-import threading
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,17 +11,13 @@ import torch
 from sympflow import SympFlow, systems, train
 from sympflow.hamiltonian.exact_flow import reference_step
 from sympflow.training import checkpoint as checkpoints
-from sympflow.training import trials
-from sympflow.training.least_squares import STOPPED, Minimum
 from sympflow.training.session import Interruption
-from sympflow.training.starts import default_primed
 from sympflow.training.table_fit import TableFit, TableRun
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="os.kill ends the process there")
 PENDULUM = systems.pendulum()
 FLOW = SympFlow.primed(PENDULUM, 2, dt=0.5, processor=2)
 QUICK = {"restarts": 4, "steps": 30, "points": 40, "reference_states": 10, "label_times": 2, "progress": False}
-SHORT = {"STARTS": 2, "STEPS": 10, "FINAL_STEPS": 10, "POINTS": 20, "LENGTH": 10}
 
 
 def interrupt():
@@ -61,10 +54,6 @@ def error_of(flow):
     return np.linalg.norm(flow(flow.dt, torch.as_tensor(x)).detach().numpy() - exact, axis=-1).mean()
 
 
-def one_step_error(flow):
-    return flow.figures["one_step_error"]
-
-
 def test_the_first_asks_and_the_second_raises():
     with Interruption() as interruption:
         with pytest.raises(KeyboardInterrupt):  # there is nothing yet
@@ -90,19 +79,6 @@ def test_a_handler_of_the_programs_own_is_left():
     assert signal.signal(signal.SIGINT, signal.default_int_handler) is handler
 
 
-def test_in_another_thread_nothing_is_installed():
-    handlers = []
-
-    def run():
-        with Interruption():
-            handlers.append(signal.getsignal(signal.SIGINT))
-
-    thread = threading.Thread(target=run)
-    thread.start()
-    thread.join()
-    assert handlers == [signal.default_int_handler]
-
-
 @pytest.mark.parametrize("start", [0, 2])
 def test_in_the_search_the_best_so_far_is_returned(monkeypatch, tmp_path, start):
     """The start that is cut short counts, but is followed to its end when the run is resumed."""
@@ -126,25 +102,6 @@ def test_in_the_search_the_best_so_far_is_returned(monkeypatch, tmp_path, start)
     assert all(torch.equal(v, resumed.state_dict()[k]) for k, v in whole.state_dict().items())
 
 
-def test_in_the_last_fits_what_they_have_is_returned(monkeypatch):
-    fits = then(monkeypatch, TableFit, "minimize", interrupt, at=QUICK["restarts"] + 1)
-    with pytest.warns(RuntimeWarning, match=r"in its last fits, after all 4 starts, because it was interrupted\."):
-        flow = train(PENDULUM, flow=FLOW, **QUICK)
-    assert len(fits) > QUICK["restarts"] + 2  # those after it end at once
-    assert one_step_error(flow) < 1e-3
-
-
-def test_an_exception_in_the_last_fits_ends_them_too(monkeypatch):
-    """As where the program has a handler of its own."""
-
-    def raise_it():
-        raise KeyboardInterrupt
-
-    then(monkeypatch, TableFit, "minimize", raise_it, at=QUICK["restarts"] + 1)
-    with pytest.warns(RuntimeWarning, match="because it was interrupted"):
-        assert one_step_error(train(PENDULUM, flow=FLOW, **QUICK)) < 1e-3
-
-
 def test_a_second_one_raises_and_the_checkpoint_stays(monkeypatch, tmp_path):
     path = tmp_path / "run.ckpt"
 
@@ -156,97 +113,3 @@ def test_a_second_one_raises_and_the_checkpoint_stays(monkeypatch, tmp_path):
     with pytest.raises(KeyboardInterrupt):
         train(PENDULUM, flow=FLOW, checkpoint=path, **QUICK)
     assert checkpoints.read(path)["step"] == QUICK["restarts"]
-
-
-def test_before_there_is_anything_it_raises(monkeypatch):
-    then(monkeypatch, TableRun, "prepare", interrupt)
-    with pytest.raises(KeyboardInterrupt):
-        train(PENDULUM, flow=FLOW, **QUICK)
-
-
-def test_where_no_residuals_are_finite_it_raises(monkeypatch):
-    """Not that the domain be made smaller: nobody knows."""
-    monkeypatch.setattr(TableFit, "minimize", lambda self, theta, *_, **__: Minimum(theta, np.inf, 0, STOPPED))
-    then(monkeypatch, TableRun, "next_minimum", interrupt)
-    with pytest.raises(KeyboardInterrupt):
-        train(PENDULUM, flow=FLOW, **QUICK)
-
-
-def short_trials(monkeypatch):
-    for name, value in SHORT.items():
-        monkeypatch.setattr(trials, name, value)
-    first, *_ = starts = [replace(default_primed(PENDULUM, phase=x), stages=2, processor=2) for x in (0.8, 1.0, 1.25)]
-    monkeypatch.setattr(trials, "tried_starts", lambda *_, **__: starts)
-    return first
-
-
-@pytest.mark.parametrize("where", ["next trial", "labels", "search"])
-def test_once_a_trial_is_done_its_flow_is_there(monkeypatch, where):
-    """The result is the flow that the trial fitted: a start that was cut short found nothing that is nearer."""
-    start = short_trials(monkeypatch)
-    tried = trials.trial(start, PENDULUM, PENDULUM.domain)
-    if where == "next trial":
-        then(monkeypatch, trials, "trial", interrupt, at=1)
-    else:
-        monkeypatch.setattr(trials, "tried_starts", lambda *_, **__: [start])
-        monkeypatch.setattr(trials, "DEAREST", 0.0)
-        name = {"labels": "prepare", "search": "next_minimum"}[where]
-        then(monkeypatch, TableRun, name, interrupt, at=1 if where == "labels" else SHORT["STARTS"])
-    with pytest.warns(RuntimeWarning, match=r"^Training .* because it was interrupted"):
-        flow = train(PENDULUM, reference_states=10, progress=False)
-    assert flow.dt == start.dt
-    for name, value in tried.flow.state_dict().items():
-        torch.testing.assert_close(flow.state_dict()[name], value, rtol=0, atol=1e-12)
-    assert 0 < one_step_error(flow) < 0.1
-
-
-def test_before_a_trial_is_done_it_raises(monkeypatch):
-    short_trials(monkeypatch)
-    then(monkeypatch, trials, "trial", interrupt)
-    with pytest.raises(KeyboardInterrupt):
-        train(PENDULUM, progress=False)
-
-
-def test_trials_say_what_they_try(monkeypatch, capsys):
-    short_trials(monkeypatch)
-    monkeypatch.setattr("sympflow.training.session.Bar", lambda *_: (_ for _ in ()).throw(ImportError()))
-    then(monkeypatch, TableRun, "go", interrupt)
-    with pytest.warns(RuntimeWarning, match="it was interrupted"):
-        train(PENDULUM, reference_states=5, progress=True)
-    said = capsys.readouterr().err
-    for start in trials.tried_starts():
-        assert f"Δt = {start.dt:g}" in said
-    assert "pendulum trials" in said
-    assert "with a curvature term" in said
-
-
-def test_a_budget_and_the_training_time_count_the_trials(monkeypatch, clock):
-    seen = {}
-
-    def chosen(system, domain, session):
-        clock.now += 5.0
-        return trials.Trial(default_primed(system), 1e-6)
-
-    def go(self, session):
-        seen.update(left=session.deadline.left, seconds=session.passed)
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(trials, "chosen_trial", chosen)
-    monkeypatch.setattr(TableRun, "go", go)
-    for options, whole in (({"time_budget": 70.0}, 70.0), ({}, math.inf)):
-        clock.now = 0.0
-        with pytest.raises(KeyboardInterrupt):
-            train(PENDULUM, progress=False, **options)
-        assert seen == {"left": whole - 5.0, "seconds": 5.0}
-
-
-def test_a_budget_that_cuts_the_last_fits_is_reported(monkeypatch, clock):
-
-    def pass_by():
-        clock.now += 100.0
-
-    then(monkeypatch, TableRun, "complete", pass_by)
-    with pytest.warns(RuntimeWarning, match=r"in its last fits, after all 4 starts, because the time budget was used"):
-        flow = train(PENDULUM, flow=FLOW, time_budget=50.0, **QUICK)
-    assert flow.recipe["stages"][-1]["ended_early"] == "the time budget was used up"
-    assert flow.figures["training_seconds"] >= 100.0

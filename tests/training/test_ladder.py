@@ -26,11 +26,9 @@ from sympflow.flow.records import FORMAT, KEY, SUM, text_checksum
 from sympflow.flow.shipped import ShippedFlow, choose
 from sympflow.integrators import flows
 from sympflow.training import pretrained
-from sympflow.training.clock_fit import clock_errors
 from sympflow.training.fits import GaussNewton, PrimedFit
-from sympflow.training.shipped import recipe
-from sympflow.training.shipped.judges import by_certificate, cost_of, one_step_errors
-from sympflow.training.shipped.recipe import SCENES, Recipe, along_the_orbit, scene_named
+from sympflow.training.shipped.judges import by_certificate
+from sympflow.training.shipped.recipe import SCENES, Recipe, along_the_orbit
 
 HH, PENDULUM, OSCILLATOR = systems.henon_heiles(), systems.pendulum(), systems.harmonic_oscillator()
 QUARTIC = HamiltonianSystem.from_sympy("p**2/2 + q**4/4", name="plain_quartic", domain=sympflow.Ball([0.0, 0.0], 1.0))
@@ -78,52 +76,6 @@ def test_the_cheapest_that_meets_the_tolerance_is_taken(three, tol, stages):
     np.testing.assert_array_equal(sol.y, reference.y)
 
 
-def test_if_none_meets_it_those_there_are_are_listed(three):
-    message = r"^`tol` 1e-09 is not met by any flow .*pendulum-primed-2 1.0e-03, pendulum-primed-6 1.0e-07.*: raise it"
-    with pytest.raises(ValueError, match=message):
-        solve(PENDULUM, "sympflow", (0.0, 1.0), tol=1e-9)
-    with pytest.raises(ValueError, match=r"^`system` 'plain_quartic' has no shipped sympflow flow .* train"):
-        solve(QUARTIC, "sympflow", (0.0, 1.0), [0.5, 0.0], tol=1e-3)
-
-
-def test_without_a_tolerance(three):
-    """The cheapest that reaches 1e-6; where no figures are known, the network."""
-    assert choose(OSCILLATOR).dt == 0.7
-    assert choose(PENDULUM).stages == 6
-    assert solve(PENDULUM, "sympflow", (0.0, 1.0)).stats["force_evaluations"] == 2 * 6
-    assert catalogue.DEFAULT_TOL == 1e-6
-
-
-def test_without_a_rung_that_reaches_the_default_the_most_accurate(three, monkeypatch):
-    monkeypatch.setattr(catalogue, "DEFAULT_TOL", 1e-12)
-    assert choose(PENDULUM).stages == 6
-
-
-def test_a_flow_without_figures_meets_no_tolerance(three):
-    with pytest.raises(ValueError, match=r"^`tol` 1 is not met by any flow .*oscillator-sympflow –"):
-        choose(OSCILLATOR, tol=1.0)
-
-
-@pytest.mark.parametrize("tol", [np.float32(1e-3), np.float64(1e-3), np.int64(1)])
-def test_numbers_of_numpy_are_tolerances(three, tol):
-    assert solve(PENDULUM, "sympflow", (0.0, 1.0), tol=tol).stats["force_evaluations"] == 2 * 2
-    assert choose(PENDULUM, tol=tol).stages == 2
-
-
-@pytest.mark.parametrize("tol", [0.0, -1.0, float("nan"), True, "1e-6"])
-def test_bad_tolerances_are_refused(tol):
-    with pytest.raises(ValueError, match=r"^`tol` must be a positive number"):
-        solve(PENDULUM, "sympflow", (0.0, 1.0), tol=tol)
-
-
-@pytest.mark.parametrize("other", [{"dt": 0.1}, {"flow": SympFlow(1)}])
-def test_a_tolerance_chooses_flow_and_step(other):
-    with pytest.raises(ValueError, match=r"^`tol` chooses the flow and its Δt"):
-        solve(PENDULUM, "sympflow", (0.0, 1.0), tol=1e-3, **other)
-    with pytest.raises(TypeError, match=r"^`tol` chooses the step .*, and a flow has its own"):
-        solve(PENDULUM, "mlp", (0.0, 1.0), tol=1e-3)
-
-
 def test_a_configured_integrator_takes_a_tolerance(three):
     method = get("sympflow")(tol=1e-5)
     assert method.step_length(PENDULUM) == 0.5
@@ -131,15 +83,6 @@ def test_a_configured_integrator_takes_a_tolerance(three):
     y = torch.tensor([[0.3, 0.1]], dtype=torch.float64)
     assert method.step(PENDULUM, 0.0, y, 0.5).shape == (1, 2)
     assert solve(PENDULUM, method, (0.0, 1.0), y0=[0.3, 0.1], dtype="float32").y.dtype == np.float32
-
-
-def test_weights_are_read_only_of_the_flow_that_is_taken(three, monkeypatch):
-    read = []
-    original = ShippedFlow.known
-    monkeypatch.setattr(ShippedFlow, "known", lambda self, system: read.append(self.name) or original(self, system))
-    for _ in range(3):
-        solve(PENDULUM, "sympflow", (0.0, 1.0), tol=1e-3)
-    assert read == ["pendulum-primed-2"]
 
 
 def test_a_tolerance_is_not_met_outside_the_domain():
@@ -224,45 +167,6 @@ def test_a_file_is_the_recipe_of_its_flow(tmp_path, monkeypatch, capsys):
             pretrained.main(unknown)
 
 
-def test_the_figures_are_those_of_the_certificate():
-    flow = SympFlow.primed(HH, 2, dt=0.5).requires_grad_(False)
-    by_certificate(flow, HH, 100.0)
-    sample = HH.domain.sample(400, 77)
-    errors = max_energy_error(solve(HH, flow, (0.0, 100.0), y0=sample, on_domain_exit="ignore"))
-    # another sample of states: quantiles agree to the noise of 100 draws
-    assert flow.figures["energy_error_median"] == pytest.approx(float(np.median(errors)), rel=0.5)
-    assert flow.figures["energy_error_95"] == pytest.approx(float(np.quantile(errors, 0.95)), rel=0.8)
-
-
-@pytest.mark.parametrize("name", ["kepler-primed-2-0.15", "kepler-primed-3-0.1", "pendulum-primed-3-0.6"])
-def test_the_figure_is_met_by_95_per_cent_of_other_states(name):
-    """1000 states of another seed to T = 1000: no more than one in twenty exceeds it."""
-    listed = next(f for f in FILES if f.name == name)
-    system = scene_named(listed.name.partition("-")[0])
-    y0 = system.domain.sample(1000, 90_210)
-    n = int(listed.t_end / listed.dt)
-    sol = solve(system, listed.load(system), (0.0, n * listed.dt), y0, save_every=5, on_domain_exit="ignore")
-    assert np.mean(max_energy_error(sol) > listed.energy_error) <= 0.05
-
-
-def test_a_rung_starts_from_the_one_with_a_longer_step(tmp_path, monkeypatch):
-    """Up to its own Δt it begins as the same map; alone it needs the other."""
-    fit, solver = PrimedFit(0.5, stages=2, processor=1, points=40, reference_states=10), GaussNewton(20, 1)
-    longer = sympflow.train(PENDULUM, fit, solver=solver, progress=False)
-    start = SympFlow.primed(PENDULUM, 2, dt=0.25, processor=1)
-    start.take_over(longer)
-    x = torch.from_numpy(PENDULUM.domain.sample(5, 0))
-    torch.testing.assert_close(start.psi(0.2, x), longer.psi(0.2, x), rtol=1e-14, atol=1e-14)
-    longer.save(tmp_path / "pendulum-longer.safetensors")
-    shorter = sympflow.train(PENDULUM, replace(fit, dt=0.25), solver=solver, progress=False)
-    shorter.save(tmp_path / "pendulum-shorter.safetensors")
-    monkeypatch.setattr(recipe, "EARLIER", {"pendulum-shorter": "pendulum-longer"})
-    again = Recipe.of(tmp_path / "pendulum-shorter.safetensors").fitted(progress=False)
-    both = lambda flow: flow.figures["one_step_error"] + flow.figures["fractional_error"]  # noqa: E731
-    assert both(again) < both(longer)
-    assert any(not torch.equal(w, shorter.state_dict()[name]) for name, w in again.state_dict().items())
-
-
 # what ships ----------------------------------------------------------------------------------------------------
 
 
@@ -288,30 +192,6 @@ def test_every_flow_ships_with_its_record(listed):
     assert listed not in FILES or (listed.cost > 0 and listed.energy_error < 0.1)
 
 
-FIRST = {(f.name.partition("-")[0], f.kind): f.name for f in reversed(shipped_flows())}
-"""The cheapest flow of each kind and scene."""
-
-
-@pytest.mark.parametrize(
-    "listed",
-    [pytest.param(f, marks=() if f.name in FIRST.values() else pytest.mark.slow) for f in shipped_flows()],
-    ids=lambda f: f.name,
-)
-def test_every_flow_is_a_map_for_all_times(listed):
-    """Networks and stiff ones included; measured on a few states, not read."""
-    system = scene_named(listed.name.partition("-")[0])
-    flow = listed.load(system)
-    if listed.shift is not None:  # in its own time it is early or late: what it is right in is the physical time
-        figures = clock_errors(flow, system, system.domain, 987, 6)
-        assert max(figures.values()) <= 10 * flow.figures["one_step_error_max"]
-        return
-    x = along_the_orbit(system, 6, 3e6, seed=1) if listed.reach else flow.domain_for(system).sample(6, 987)
-    omega = system.params.get("omega", 1.0) if system.ndof == 1 else 1.0
-    at_end, between = one_step_errors(flow, system, x, times=8, omega=omega)
-    assert between <= 10 * at_end
-    assert at_end <= 10 * listed.one_step_error * max(1.0, omega)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", LADDERS)
 def test_shipped_figures_hold(name):
@@ -330,22 +210,3 @@ def test_shipped_figures_hold(name):
         errors = np.sort(kept)
         assert errors[len(errors) * 9 // 10] <= 3 * listed.energy_error
         assert listed.energy_error < 100 * errors[-1] + 1e-9
-
-
-@pytest.mark.parametrize("name", LADDERS)
-def test_what_costs_more_is_more_accurate(name):
-    rungs = [f for f in shipped_flows(SCENES[name]()) if f.stages]
-    errors = [f.energy_error for f in rungs]  # the cheapest first
-    cheap = {"outer_solar_system": 0.1}  # the cheapest rung is better than 1e-4 already
-    assert errors[-1] < cheap.get(name, 1e-3) * errors[0]
-    of_state = {  # polynomials that are fitted to the state alone, beside flows for the energy
-        f.name for f in rungs if f.polynomial and f.load().recipe["stages"][0]["energy_weight"] == 0.0
-    }
-    of_state.add("driven_pendulum-primed-8-0.5")  # a third of the state error of the rung before
-    of_state.add(
-        "fput_beta-primed-5-0.68"
-    )  # a seventh of the state error of the rung before; its limit is of rare states
-    cheaper = [(f, g) for f in rungs for g in rungs if g.cost <= f.cost and g.energy_error < f.energy_error]
-    assert not [(f.name, g.name) for f, g in cheaper if f.name not in of_state]  # no rung is dominated by another
-    assert not [(f.name, g.name) for f, g in cheaper if g.one_step_error / g.dt < f.one_step_error / f.dt]
-    assert all(f.cost == pytest.approx(cost_of(f.load()), rel=1e-3) for f in rungs)

@@ -6,10 +6,7 @@ import numpy as np
 import pytest
 
 import sympflow
-from sympflow import Box, HamiltonianSystem, LatticeStates, SympFlow, solve, train
-from sympflow.flow.primed import PrimedFlow
-from sympflow.training import lattice_fit, table_fit
-from sympflow.training.lattice_fit import TAIL, LatticeSubsystem
+from sympflow import HamiltonianSystem, LatticeStates, SympFlow, solve, train
 
 BOND = "r**2/2 + r**4/4"
 FIT = {"restarts": 1, "steps": 8, "points": 20, "label_times": 3, "reference_states": 10, "progress": False}
@@ -42,43 +39,6 @@ def test_states_have_the_density_of_the_lattice_at_every_size():
     assert not large.contains(spike)
 
 
-def test_a_piece_has_the_states_of_the_lattice():
-    y0 = LatticeStates(0.3, ring(200)).sample(1)[0]
-    low, high = ring(200, y0=y0).subsystem(8).domain.bounds
-    assert low == pytest.approx(0.3, rel=0.3)
-    assert high == pytest.approx(low, rel=1.0)
-    of_box = ring(6, domain=Box([-0.5] * 12, [0.5] * 12)).subsystem().domain
-    assert 0.01 < of_box.bounds[0] < of_box.bounds[1] < 1
-    large = ring(200)
-    fitted = LatticeSubsystem.of(large, LatticeStates((0.1, 0.3)).of(large))
-    assert fitted.domain.bounds == (0.1, TAIL * 0.3)  # a few neighbours have more than all of them
-    assert fitted.states.bounds == (0.1, 0.3)
-    assert ring(200).subsystem(8).domain is None
-    with pytest.raises(TypeError, match=r"^`system` 'H = .*' is not a lattice"):
-        HamiltonianSystem.from_sympy("p**2/2 + q**2/2").subsystem()
-    with pytest.raises(ValueError, match=r"^`sites` must be one to 3 positive integers"):
-        ring(200).subsystem(0)
-    with pytest.raises(ValueError, match=r"^`density` must be positive"):
-        LatticeStates((0.3, 0.2))
-    with pytest.raises(ValueError, match="`domain` is not known"):
-        train(ring(200))
-
-
-@pytest.mark.parametrize("boundary", ["periodic", "fixed", "free"])
-def test_the_expression_by_coordinates_is_the_same_H(boundary):
-    lattice = HamiltonianSystem.lattice(
-        onsite="a*u**2/2 + u**2*v**2",
-        bond={1: "c*r_u**2/2 + r_v**2/2 + r_u**2*r_v", 2: "r_u**4/4"},
-        fields=("u", "v"),
-        shape=(5, 6),
-        boundary=(boundary, "fixed"),
-        params={"a": np.linspace(1, 2, 30).reshape(5, 6), "c": 0.5},
-    )
-    written = HamiltonianSystem.from_sympy(lattice.local.written_out())
-    y = np.random.default_rng(0).normal(size=(3, 120))
-    np.testing.assert_allclose(written.hamiltonian(y), lattice.hamiltonian(y), rtol=1e-12)
-
-
 def test_a_flow_serves_every_shape(flow, tmp_path):
     assert flow.ndof == 40
     assert flow.recipe["fitted_on"] == 6
@@ -97,66 +57,6 @@ def test_a_flow_serves_every_shape(flow, tmp_path):
         H = lattice.hamiltonian(runs[0].states)
         assert np.ptp(H) / H[0] < 10 * flow.figures["energy_error_95"]
     assert sympflow.load(tmp_path / "flow.safetensors", system=ring(12)).system.ndof == 12
-
-
-@pytest.mark.slow
-def test_a_fit_to_long_runs_keeps_the_energy_of_other_states(flow, monkeypatch):
-    """With the table that they found at Δt, which the numbers at shorter times lead to."""
-    monkeypatch.setattr(table_fit, "RUN_STEPS", 8)
-    lattice = ring(domain=LatticeStates(0.2))
-    further = train(lattice, flow=flow, runs=32, seed=1, **FIT | {"steps": 8})
-    assert [stage.get("runs") for stage in further.recipe["stages"]] == [None, 32]
-    large = ring(200, domain=LatticeStates(0.2))
-    y0 = large.domain.sample(4, seed=77)
-    errors = []
-    for each in (flow, further):
-        H = large.hamiltonian(solve(large, each, (0, 40), y0, t_eval=np.linspace(0, 40, 9)).states)
-        errors.append(np.sqrt(np.mean((H / H[:, :1] - 1) ** 2)))
-    assert errors[1] < errors[0]
-    numbers = [further.scheme(t).drifts for t in (0.2, 0.25)]
-    np.testing.assert_allclose(*numbers, atol=0.02)
-
-
-@pytest.mark.slow
-def test_runs_alone_ask_for_a_primed_flow():
-    """As the page on large systems has it: no other option says so."""
-    with pytest.warns(RuntimeWarning):  # wherever the time is up
-        flow = train(ring(domain=LatticeStates(0.2)), runs=2, time_budget=0.5, progress=False)
-    assert isinstance(flow, PrimedFlow)
-
-
-def test_a_table_that_overflowed_is_as_bad_as_can_be(flow):
-    """And is left out of the flow: a search that took too long a step goes on."""
-    lattice = ring(12, domain=LatticeStates(0.2))
-    mine = flow.of_any_size(lattice)
-    runs = lattice_fit.EnergyRuns(mine, lattice, lattice.domain.sample(2), 0.0, 1.0)
-    offset, design = runs.table.polynomial(np.array([flow.dt]))
-    theta = runs.table.frozen_parameters(offset[0] + design[0] @ runs.table.parameters())
-    before = runs.residuals(theta)
-    after = runs.residuals(np.full_like(theta, np.nan))
-    assert np.isfinite(before).all()
-    assert after.shape == before.shape
-    assert np.isinf(after).all()
-    np.testing.assert_array_equal(runs.residuals(theta), before)
-
-
-@pytest.mark.slow
-def test_long_runs_are_of_lattices_that_keep_their_energy(flow):
-    lattice = ring(domain=LatticeStates(0.2))
-    with pytest.raises(ValueError, match=r"^`runs` must be a positive integer; got 0"):
-        train(lattice, flow=flow, runs=0, **FIT)
-    with pytest.raises(ValueError, match=r"^`runs` need a lattice that conserves its energy, and"):
-        train(ring(damping=0.1, domain=LatticeStates(0.2)), dt=0.2, runs=4, **FIT)
-    pendulum = HamiltonianSystem.from_sympy("p**2/2 - cos(q)", domain=Box([-1, -1], [1, 1]))
-    with pytest.raises(ValueError, match=r"^`runs` need a lattice that conserves its energy, and"):
-        train(pendulum, dt=0.5, runs=4, **FIT)
-    with pytest.raises(ValueError, match=r"^`runs` begin in states of a larger piece of the system, and `data`"):
-        train(lattice, runs=4, data=([0.1], np.zeros((1, 512)), np.zeros((1, 512))))
-    with pytest.raises(TypeError, match=r"^`runs` is not an option of the optimizer 'adam' for flows of kind 'sympf"):
-        train(lattice, runs=4, kind="sympflow")
-    with pytest.warns(RuntimeWarning) as seen:
-        train(lattice, flow=flow, runs=4, time_budget=1e-3, **FIT)
-    assert "The flow was not fitted to `runs`, because the time was up." in [str(w.message) for w in seen]
 
 
 @pytest.mark.parametrize(
@@ -178,36 +78,6 @@ def test_another_lattice_is_refused_by_the_term_that_differs(flow, other, reason
         flow.transferred(other if other.ndof != 40 else ring(41, bond="r**2/2 + r**4/5"))
 
 
-def test_what_is_no_lattice_is_refused(flow):
-    written = HamiltonianSystem.from_sympy(ring(6).local.written_out())
-    with pytest.raises(ValueError, match=r"^`system` '.*' has 6 degrees of freedom but the flow 40"):
-        solve(written, flow, (0, 5), np.full(12, 0.1), backend="array")
-    with pytest.raises(ValueError, match=r"^`system` 'pairs' is of another kind than that of this flow"):
-        solve(HamiltonianSystem.pairs("1/r", masses=np.ones(2), dim=2), flow, (0, 5), np.arange(8.0))
-
-
-def test_the_flow_of_a_damped_lattice_is_of_its_friction():
-    lattice = ring(20, damping=0.1, domain=LatticeStates(0.2))
-    flow = train(lattice, flow=SympFlow.primed(lattice, 2, dt=0.25, processor=0), **FIT)
-    y0 = np.full(60, 0.1)
-    assert solve(ring(30, damping=0.1), flow, (0, 5), y0, backend="array").success
-    for other in (ring(30, damping=0.2), ring(30)):
-        with pytest.raises(ValueError, match="its friction is another"):
-            solve(other, flow, (0, 5), y0)
-
-
-@pytest.mark.slow
-def test_the_flow_of_a_disordered_lattice_is_of_its_arrays():
-    masses = np.random.default_rng(0).uniform(0.8, 1.2, 20)
-    options = {"kinetic": "p**2/(2*m)", "domain": LatticeStates(0.2)}
-    lattice = ring(20, params={"m": masses}, **options)
-    flow = train(lattice, flow=SympFlow.primed(lattice, 2, dt=0.25, processor=0), **FIT)
-    y0 = lattice.domain.sample(1)[0]
-    assert solve(lattice, flow, (0, 5), y0, backend="array").success
-    with pytest.raises(ValueError, match="its array 'm' is one of shape"):
-        solve(ring(20, params={"m": masses + 1e-3}, **options), flow, (0, 5), y0)
-
-
 def test_ends_at_which_the_numbers_do_not_hold_are_refused(flow, monkeypatch):
     free = ring(30, boundary="free")
     y0 = LatticeStates(0.2, free).sample(1)[0]
@@ -215,16 +85,3 @@ def test_ends_at_which_the_numbers_do_not_hold_are_refused(flow, monkeypatch):
     monkeypatch.setitem(flow.figures, "ends_free", 3 * flow.figures["ends_periodic"])
     with pytest.raises(ValueError, match=r"^`system` 'lattice' has free ends"):
         solve(free, flow, (0, 5), y0)
-
-
-@pytest.mark.slow
-def test_curvature_terms_run_in_the_loops_of_a_lattice():
-    lattice = ring(12)
-    flow = SympFlow.primed(lattice, 2, dt=0.2, curvature=True)
-    flow.gradients.set_constant([1e-2, 1e-2])
-    flow.curvatures.set_constant([1e-2, 1e-2])
-    y0 = np.random.default_rng(1).normal(scale=0.3, size=24)
-    runs = [solve(lattice, flow, (0, 2), y0, t_eval=[2.0], backend=b).y for b in ("compiled", "array")]
-    np.testing.assert_allclose(*runs, rtol=0, atol=1e-12)
-    plain = solve(lattice, SympFlow.primed(lattice, 2, dt=0.2), (0, 2), y0, t_eval=[2.0]).y
-    assert np.abs(plain - runs[0]).max() > 1e-6

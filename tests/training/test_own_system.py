@@ -5,7 +5,7 @@ import sys
 import pytest
 from conftest import load_example
 
-from sympflow import Box, EnergySublevel, HamiltonianSystem, systems
+from sympflow import systems
 from sympflow.flow.primed import PrimedFlow
 
 
@@ -26,8 +26,3 @@ def test_own_system_in_a_minute(monkeypatch, capsys):
     rows = {line.split()[0]: line.split() for line in out.splitlines() if line.endswith("×")}
     assert {"the", "kahan_li8", "blanes_moan4"} == set(rows)
     assert rows["the"][-1] == "1.00×"
-
-
-def test_an_empty_sublevel_is_named_as_the_cause():
-    with pytest.raises(ValueError, match=r"0 of .* drawn\): raise `energy`, for the sublevel seems to be empty"):
-        HamiltonianSystem.from_sympy("p**2/2+q**2/2", domain=EnergySublevel(-1.0, Box([-1, -1], [1, 1])), y0=[0.5, 0])

@@ -3,13 +3,11 @@
 import inspect
 import math
 
-import numpy as np
 import pytest
 import torch
 
 import sympflow
 from sympflow import HamiltonianSystem, SympFlow, systems, train
-from sympflow.training import checkpoint as checkpoints
 from sympflow.training import trials
 from sympflow.training.fits import (
     BFGS,
@@ -24,7 +22,6 @@ from sympflow.training.fits import (
     SplitFit,
     keywords,
 )
-from sympflow.training.table_fit import TableRun
 
 HH, PENDULUM, OSCILLATOR = systems.henon_heiles(), systems.pendulum(), systems.harmonic_oscillator()
 BOX = sympflow.Box([-1.0, -1.0], [1.0, 1.0])
@@ -142,13 +139,6 @@ def test_what_cannot_be_is_named_before_anything_begins(monkeypatch, system, arg
         train(system, **arguments)
 
 
-def test_where_no_checkpoint_can_be_written_is_said_at_once(tmp_path):
-    (tmp_path / "file").touch()
-    for path in (tmp_path, tmp_path / "file" / "run.ckpt"):
-        with pytest.raises(ValueError, match=r"^`checkpoint` .* cannot be written \(.*\): name a file that can be"):
-            train(PENDULUM, checkpoint=path)
-
-
 def test_what_is_no_system_or_scheme_is_named(tmp_path):
     with pytest.raises(TypeError, match=r"^`system` must be a HamiltonianSystem; got float"):
         train(2.0)
@@ -157,22 +147,6 @@ def test_what_is_no_system_or_scheme_is_named(tmp_path):
         sympflow.load(tmp_path / "flow.safetensors", system="pendulum")
     with pytest.raises(TypeError, match=r"^`scheme` must be a Scheme or the name of one; got 3: choose one of"):
         SympFlow.primed(PENDULUM, scheme=3)
-
-
-def test_numbers_may_be_numpys(tmp_path):
-    """They are recorded as Python's, so that a checkpoint of such a run can be compared with one of another."""
-    flow = SympFlow.primed(PENDULUM, np.int64(2), dt=np.float32(0.5), processor=np.int32(1))
-    assert (flow.dt, flow.architecture()) == (0.5, SympFlow.primed(PENDULUM, 2, dt=0.5, processor=1).architecture())
-    assert SympFlow(np.int64(1), pairs=np.int64(2), hidden=(np.int64(3), 4), dt=np.float32(0.5)).dt == 0.5
-    assert PrimedFit(points=np.int64(30), energy_weight=np.float32(10)) == PrimedFit(points=30)
-    assert GaussNewton(np.int64(2), np.int64(1)) == GaussNewton(steps=2, restarts=1)
-    plain = {"dt": 0.5, "stages": 2, "points": 30, "restarts": 1, "steps": 2, "reference_states": 5}
-    path = tmp_path / "run.ckpt"
-    train(PENDULUM, checkpoint=path, progress=False, **{k: np.asarray(v)[()] for k, v in plain.items()})
-    assert train(PENDULUM, resume=path, progress=False, **plain).dt == 0.5
-    for refused in (True, np.bool_(True), np.float64(2.5), np.array([2])):
-        with pytest.raises(ValueError, match=r"^`stages` must be a positive integer"):
-            SympFlow.primed(PENDULUM, refused)
 
 
 @pytest.mark.parametrize(
@@ -187,12 +161,6 @@ def test_numbers_may_be_numpys(tmp_path):
 def test_systems_without_a_primed_flow_are_told_what_to_leave_out(system, arguments, message):
     with pytest.raises(ValueError, match=message):
         train(system, **arguments)
-
-
-def test_the_remedies_work():
-    quick = {"steps": 1, "points": 20, "validation_points": 20, "reference_states": 2, "progress": False}
-    assert train(RELATIVISTIC, stages=1, optimizer="bfgs", **quick).kind == "sympflow"
-    assert train(WHOLE, pairs=1, hidden=(3,), **quick).kind == "sympflow"
 
 
 def test_unknown_options_are_refused_with_those_that_there_are():
@@ -240,44 +208,9 @@ def test_keywords_say_what_fits_and_solvers_say(system, fit, solver, keywords):
     assert all(torch.equal(v, plain.state_dict()[name]) for name, v in objects.state_dict().items())
 
 
-@pytest.mark.parametrize(
-    ("cls", "name"), [(SplitFit, "points"), (ClockedFit, "points"), (PrimedFit, "label_times"), (Adam, "steps")]
-)
-def test_none_is_refused_where_no_choice_is_left_open(cls, name):
-    with pytest.raises(ValueError, match=f"^`{name}` must be a positive integer; got None: give 1 or more"):
-        cls(**{name: None})
-    assert PrimedFit(points=None).points is Adam(refresh=None).refresh is None
-
-
 def test_a_fit_makes_its_own_split_flow_or_clock():
     spring = systems.spring_pendulum(1e3, coordinates="polar")
     flow = train(spring, SplitFit(dt=0.05, stages=1, terms=2, **QUICK), solver=GaussNewton(1, 1), progress=False)
     assert (type(flow).__name__, flow.dt, flow.recipe["stages"][0]["restarts"]) == ("SplitFlow", 0.05, 1)
     flow = train(systems.kepler(0.6), ClockedFit(0.5, points=20, label_times=3, terms=4))
     assert (type(flow).__name__, flow.figures["step"]) == ("ClockedFlow", 0.5)
-
-
-class Started(Exception):
-    pass
-
-
-def test_a_run_of_trials_is_resumed_whatever_else_is_said_now(monkeypatch, tmp_path):
-    """A short budget, and the default of its fit, say nothing of its flow."""
-    path, start = tmp_path / "run.ckpt", trials.tried_starts(HH, HH.domain)[-1]
-    assert start.curvature
-
-    def kill(*_):
-        raise Started
-
-    with monkeypatch.context() as patch, pytest.raises(Started):
-        patch.setattr(TableRun, "next_minimum", kill)
-        train(HH, flow=start.flow(HH), checkpoint=path, progress=False)
-    assert checkpoints.read(path)["step"] == 0
-    monkeypatch.setattr(TableRun, "go", kill)
-    for options in ({}, {"time_budget": 30.0}, {"time_budget": 30.0, "loss": "labels"}, {"time_budget": 90.0}):
-        with pytest.raises(Started):
-            train(HH, resume=path, progress=False, **options)
-    with pytest.raises(ValueError, match=r"^`resume` is a run with another restarts"):
-        train(HH, resume=path, restarts=3, progress=False)
-    with pytest.raises(ValueError, match=r"^`resume` is a run with another architecture: .* arguments of the flow"):
-        train(HH, stages=2, resume=path, progress=False)

@@ -1,19 +1,16 @@
 """Gauss–Newton training of networks: residuals, Jacobians, the search, labels and data, and what train() chooses."""
 
 import math
-import warnings
 
 import numpy as np
 import pytest
 import torch
 
-import sympflow
 from sympflow import Box, HamiltonianSystem, MLPFlow, SympFlow, load, solve, systems, train
 from sympflow.flow.primed import PrimedFlow
 from sympflow.flow.scaling import Scaling
-from sympflow.training.least_squares import PULL, GaussNewtonSteps
-from sympflow.training.losses import Loss, Objective, jacobian
-from sympflow.training.points import Labels, Points, PointSource, unlabelled
+from sympflow.training.losses import Loss, Objective
+from sympflow.training.points import Labels, PointSource, unlabelled
 
 HH, OSCILLATOR, PENDULUM = systems.henon_heiles(), systems.harmonic_oscillator(), systems.pendulum()
 QUICK = {
@@ -77,36 +74,7 @@ def test_the_jacobian_by_differences(weights):
     torch.testing.assert_close(J @ direction, (ends[0] - ends[1]) / (2 * e), rtol=1e-6, atol=1e-8)
 
 
-def test_forward_and_reverse_mode_agree():
-    """A primed flow of three parameters takes forward mode, one with more of them reverse mode."""
-    sample = (torch.tensor([0.3, 0.9]), torch.tensor(HH.domain.sample(2, 0)))
-    flow = SympFlow.primed(HH, 1, degree=1)
-    assert flow.n_parameters < 4 < FLOWS["sympflow"]().n_parameters
-    r, J = jacobian(flow, Loss(HH, Scaling.unit(2)).residual, sample)
-    assert (r.shape, J.shape) == ((2, 4), (2, 4, flow.n_parameters))
-    value = Loss(HH, Scaling.unit(2)).residual(flow, *sample)
-    for i, j in np.ndindex(2, 4):
-        slopes = torch.autograd.grad(value[i, j], list(flow.parameters()), retain_graph=True)
-        torch.testing.assert_close(J[i, j], torch.cat([s.reshape(-1) for s in slopes]))
-
-
 # the search ----------------------------------------------------------------------------------------------------------
-
-
-class Quadratic:
-    """An objective with residuals A x − b, of a module's only parameter x."""
-
-    def __init__(self, module, A, b, draw=0):
-        self.module, self.A, self.b, self.draw = module, A, b, draw
-
-    def residuals(self):
-        return self.A @ self.module.x.detach() - self.b
-
-    def __call__(self):
-        return self.residuals().square().sum()
-
-    def linearized(self):
-        return self.residuals(), self.A
 
 
 def module(n):
@@ -116,71 +84,7 @@ def module(n):
     return result
 
 
-@pytest.mark.parametrize("damping", [1e-4, 1e-14], ids=["normal equations", "QR"])
-@pytest.mark.parametrize("worst", [1.0, 1e-7])
-def test_a_linear_problem_is_solved_at_once(damping, worst):
-    """However ill-conditioned: where the normal equations would lose all digits, the QR factorization is taken."""
-    rng = np.random.default_rng(0)
-    A = torch.tensor(rng.normal(size=(40, 5)))
-    A[:, 0] = A[:, 1] + worst * A[:, 0]
-    b = A @ torch.arange(1.0, 6.0, dtype=torch.float64)
-    target = module(5)
-    method = GaussNewtonSteps(target)
-    method.damping.value = damping
-    cost = [method.step(0, Quadratic(target, A, b)) for _ in range(8)]
-    assert cost[-1] < 1e-12 * cost[0]
-    if damping == 1e-14:
-        pulled = torch.cat([A, PULL**0.5 * torch.eye(5)]), torch.cat([b, torch.zeros(5, dtype=b.dtype)])
-        torch.testing.assert_close(target.x.detach(), torch.linalg.lstsq(*pulled).solution, rtol=1e-5, atol=0)
-
-
-def test_a_weight_that_no_point_sees_does_not_run_away():
-    """A saturated neuron of the first Gauss–Newton networks had a slope of 5e7 between two points."""
-    A, b = torch.zeros(10, 2, dtype=torch.float64), torch.linspace(0, 1, 10, dtype=torch.float64)
-    A[:, 0] = 1.0
-    target = module(2)
-    with torch.no_grad():
-        target.x[1] = 1e8
-    method = GaussNewtonSteps(target)
-    for _ in range(40):
-        method.step(0, Quadratic(target, A, b))
-    assert target.x[1].abs() < 1.0
-    assert target.x[0].item() == pytest.approx(0.5, rel=1e-9)
-
-
-def test_it_stops_by_itself():
-    flow = train(PENDULUM, 0.1, optimizer="gauss-newton", steps=10**5, **{**QUICK, "hidden": (2,)})
-    stage = flow.recipe["stages"][0]
-    assert stage["steps_taken"] < 300
-    assert stage["finished"]
-    assert stage["ended_early"] is None
-
-
-def test_it_goes_on_with_fresh_points():
-    flow = train(OSCILLATOR, optimizer="gauss-newton", steps=24, refresh=6, **QUICK)
-    assert flow.recipe["stages"][0]["steps_taken"] == 24
-    assert flow.history[-1]["loss"] < flow.history[0]["loss"] / 3
-
-
-@pytest.mark.slow
-def test_it_beats_adam_by_far():
-    """Equal architecture and points: 40 steps against 400 gradient steps on fresh points."""
-    common = {**QUICK, "pairs": 2, "hidden": (8,), "points": 300, "matching_weight": 0.0}
-    adam = train(OSCILLATOR, optimizer="adam", steps=400, learning_rate=1e-2, **common)
-    newton = train(OSCILLATOR, optimizer="gauss-newton", steps=40, **common)
-    assert newton.figures["one_step_error"] < adam.figures["one_step_error"] / 20
-
-
 # labels and data -------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("optimizer", ["gauss-newton", "adam", "lbfgs"])
-def test_labels_alone_train(optimizer):
-    steps = {"gauss-newton": 30, "adam": 600, "lbfgs": 20}[optimizer]
-    mix = {"residual_weight": 0.0, "matching_weight": 0.0, "label_weight": 1.0, "label_times": 4}
-    flow = train(OSCILLATOR, optimizer=optimizer, steps=steps, **mix, **QUICK)
-    assert flow.history[-1]["label_loss"] < flow.history[0]["label_loss"] / 4
-    assert "residual_loss" not in flow.figures
 
 
 def test_data_is_used_and_a_tenth_of_it_held_out():
@@ -235,14 +139,6 @@ class TestLabelsAtFewTimes:
         with pytest.warns(UserWarning, match=message):
             ask(labelled_at_dt, torch.tensor(OSCILLATOR.domain.sample(2)))
 
-    def test_results_at_them_do_not(self, labelled_at_dt):
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            solve(OSCILLATOR, labelled_at_dt, (0, 3), t_eval=[1.0, 3.0])
-            solve(OSCILLATOR, labelled_at_dt, (3, 0), dense_output=True).sol([2.0, 1.0])
-            labelled_at_dt(3.0, torch.tensor(OSCILLATOR.domain.sample(2)))
-        assert not [one for one in caught if issubclass(one.category, UserWarning)]
-
     @pytest.mark.parametrize(
         ("t", "gaps"),
         [
@@ -255,13 +151,6 @@ class TestLabelsAtFewTimes:
     )
     def test_gaps_are_longer_than_an_eighth(self, t, gaps):
         assert unlabelled(np.asarray(t), 1.0) == gaps
-
-
-def test_a_resumed_run_with_other_data_is_refused(tmp_path):
-    t, x, y = labels(20)
-    train(HH, data=(t, x, y), steps=2, checkpoint=tmp_path / "run.ckpt", optimizer="gauss-newton", **QUICK)
-    with pytest.raises(ValueError, match="`resume` is a run with another data"):
-        train(HH, data=(t, x, y * (1 + 1e-6)), steps=2, resume=tmp_path / "run.ckpt", optimizer="gauss-newton", **QUICK)
 
 
 @pytest.mark.parametrize(
@@ -278,17 +167,6 @@ def test_bad_data_is_refused(data, error, message):
         train(HH, data=data, **QUICK)
 
 
-def test_labels_are_a_function_of_seed_and_draw():
-    def source():
-        return PointSource(HH.domain, 1.0, 4, 2, 0, torch.float64, CPU, block=1, labels=labels(10))
-
-    one, other = source(), source()
-    assert all(torch.equal(a, b) for a, b in zip(one(3).labels, other(3).labels, strict=True))
-    assert not torch.equal(one(3).labels[1], one(4).labels[1])
-    assert len(one(3).labels[0]) == 4
-    assert isinstance(one(3), Points)
-
-
 # what train() chooses --------------------------------------------------------------------------------------------
 
 
@@ -303,20 +181,3 @@ def test_other_systems_get_a_network():
         assert isinstance(flow, SympFlow)
         assert not isinstance(flow, PrimedFlow)
         assert flow.recipe["stages"][0]["optimizer"] == "adam"
-
-
-def test_a_primed_flow_trains_as_a_network_does():
-    start = SympFlow.primed(PENDULUM, 2, dt=0.5)
-    flow = train(
-        PENDULUM,
-        flow=start,
-        optimizer="adam",
-        steps=30,
-        points=50,
-        validation_points=50,
-        reference_states=5,
-        progress=False,
-    )
-    assert isinstance(flow, PrimedFlow)
-    assert flow.history[-1]["loss"] < flow.history[0]["loss"]
-    assert sympflow.solve(PENDULUM, flow, (0.0, 5.0)).success

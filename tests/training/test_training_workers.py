@@ -1,23 +1,17 @@
 """Trials, starts, fits and rungs are shared by workers: the same bits come of it, and Ctrl-C ends it."""
 
 import os
-import pickle
 import signal
 import sys
-import threading
 from concurrent.futures import ThreadPoolExecutor
 
-import numpy as np
 import pytest
 import torch
 
 from sympflow import HamiltonianSystem, SympFlow, systems, train
 from sympflow.training import trials
-from sympflow.training.fits import GaussNewton, PrimedFit, SplitFit
 from sympflow.training.session import Session
-from sympflow.training.split_fit import SplitRun
-from sympflow.training.starts import scaling_of
-from sympflow.training.table_fit import TableFit, TableRun
+from sympflow.training.table_fit import TableFit
 from sympflow.workers import WorkerPool
 
 PENDULUM = systems.pendulum()
@@ -37,11 +31,6 @@ def test_searches_are_the_same_whatever_the_workers():
     assert len(alone.history) == QUICK["restarts"] + 1
 
 
-@pytest.mark.slow
-def test_searches_are_the_same_in_processes():
-    assert same(train(PENDULUM, flow=FLOW, workers=2, **QUICK), train(PENDULUM, flow=FLOW, **QUICK))
-
-
 def test_trials_are_the_same_whatever_the_workers(monkeypatch):
     for name, value in {"STARTS": 2, "STEPS": 5, "FINAL_STEPS": 5, "POINTS": 20, "LENGTH": 5}.items():
         monkeypatch.setattr(trials, name, value)
@@ -50,34 +39,6 @@ def test_trials_are_the_same_whatever_the_workers(monkeypatch):
         found = trials.chosen_trial(PENDULUM, PENDULUM.domain, Session(pool=WorkerPool(threads)))
     assert (found.start, found.error) == (alone.start, alone.error)
     assert same(found.flow, alone.flow)
-
-
-def test_fits_are_the_same_in_another_process():
-    """Their products are rounded by the order of arrays in memory, which a pickle must not change."""
-    few = {"points": 20, "label_times": 3, "reference_states": 5, "loss_points": 10, "matching_times": 2}
-    table = PrimedFit(loss="labels+residual", **few)
-    run = TableRun(FLOW, PENDULUM, PENDULUM.domain, scaling_of(PENDULUM.domain, FLOW.dt, 0), table)
-    theta = run.table.continued(run.frozen.coefficients(run.start_of(1))[0])
-    fits = [(run.frozen, run.start_of(1)), (run.weighted, run.start_of(0)), (run.whole, theta)]
-    for fit, x in fits:
-        for other in (pickle.loads(pickle.dumps(fit)), fit.own()):
-            assert all(np.array_equal(a, b) for a, b in zip(fit.linearized(x), other.linearized(x), strict=True))
-    run.table.assign(run.given)
-    run.whole.own().residuals(theta)
-    assert np.array_equal(run.table.parameters(), run.given)
-
-
-@pytest.mark.slow
-def test_split_fits_are_the_same_in_another_process():
-    spring = systems.spring_pendulum(1e3, coordinates="polar")
-    flow = SympFlow.split(spring, dt=0.05, stages=1, terms=2)
-    fit, solver = SplitFit(points=5, label_times=2, reference_states=3), GaussNewton(steps=2, restarts=2)
-    run = SplitRun(flow.bound(spring), spring, spring.domain, None, fit, solver)
-    fit, u = run.searched(), run.start_of(1)
-    other = pickle.loads(pickle.dumps(fit.own()))
-    mine, theirs = (f.minimize(u, 2, Session().deadline) for f in (fit, other))
-    assert np.array_equal(mine.x, theirs.x)
-    assert mine.cost == theirs.cost
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="os.kill ends the process there")
@@ -101,21 +62,6 @@ def test_ctrl_c_does_not_wait_for_workers(monkeypatch):
     finally:
         signal.signal(signal.SIGINT, before)
     assert flow.recipe["stages"][-1]["restarts_taken"] < 50
-
-
-def in_main_thread(event, item):
-    """The item; other threads wait for the event."""
-    return item if threading.current_thread() is threading.main_thread() or event.wait() else None
-
-
-def test_a_time_budget_does_not_wait_for_workers_that_start():
-    event = threading.Event()
-    with ThreadPoolExecutor(2) as threads:
-        session = Session(time_budget=0.05, pool=WorkerPool(threads))
-        try:
-            assert list(session.each(in_main_thread, event, range(5), session.deadline)) == [*range(5)]
-        finally:
-            event.set()
 
 
 def test_what_cannot_be_pickled_is_named(monkeypatch):

@@ -1,13 +1,11 @@
 """The flow that `train` fits to a system of which nothing else is said: the cost of kicks, and short trials."""
 
-import time
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from sympflow import max_energy_error, solve, systems, train
-from sympflow.kernels.splitting_loops import splitting_loops
 from sympflow.training import trials
 from sympflow.training.least_squares import Minimum
 from sympflow.training.points import Stream, states
@@ -16,7 +14,6 @@ from sympflow.training.starts import SEED, default_primed
 from sympflow.training.table_fit import TableFit, TableRun
 
 HH, PENDULUM = systems.henon_heiles(), systems.pendulum()
-QUICK = {"STARTS": 2, "STEPS": 20, "FINAL_STEPS": 20, "POINTS": 40, "LENGTH": 50}
 
 
 @pytest.mark.parametrize("seconds", [0.0, 0.02], ids=["none", "some"])
@@ -33,12 +30,6 @@ def test_trials_that_the_time_ended_are_warned_of(monkeypatch, clock, seconds):
         trials.chosen_trial(HH, HH.domain, Session(time_budget=1e-3))
     monkeypatch.setattr(trials, "SHAPES", trials.SHAPES[:1])
     trials.chosen_trial(HH, HH.domain, Session(time_budget=100.0))  # warnings are errors
-
-
-@pytest.mark.parametrize("system", [HH, PENDULUM, systems.quartic()], ids=lambda s: s.name)
-def test_each_term_makes_a_kick_dearer(system):
-    cycles = [splitting_loops(system).kick_cycles(level) for level in range(3)]
-    assert 0 < cycles[0] < cycles[1] < cycles[2]
 
 
 def law(monkeypatch, error):
@@ -59,11 +50,6 @@ def test_the_order_of_the_error_decides_between_short_and_long_steps(monkeypatch
     assert law(monkeypatch, lambda x, c: 1e-9 * x**12) == first
 
 
-def test_a_long_step_that_misses_the_goal_is_not_taken(monkeypatch):
-    first, *_ = trials.tried_starts(HH, HH.domain, curvature=False)
-    assert law(monkeypatch, lambda x, c: 9e-6 if x == 1.0 else 1.1e-5) == first
-
-
 def test_where_all_miss_the_goal_the_least_error_is_taken(monkeypatch):
     """The longest step wins among errors that are alike; curvature terms where they alone meet the goal."""
     first, *_, last = trials.tried_starts(HH, HH.domain, curvature=False)
@@ -82,59 +68,6 @@ def test_a_map_that_keeps_the_energy_alone_is_no_candidate(monkeypatch):
     assert trials.trial(default_primed(PENDULUM), PENDULUM, PENDULUM.domain).error == 0.0
 
 
-def test_curvature_is_taken_where_its_error_is_worth_its_cycles(monkeypatch):
-    """Kicks that are r times dearer must make the error r⁶ times less."""
-    plain, bent = (splitting_loops(HH).kick_cycles(level) for level in (1, 2))
-    needed = (bent / plain) ** trials.ORDER
-    for gain, taken in ((1.1 * needed, True), (0.9 * needed, False)):
-        chosen = law(monkeypatch, lambda x, c, gain=gain: 1e-9 * x**12 / (gain if c else 1.0))
-        assert chosen.curvature is taken
-
-
-def test_another_shape_is_taken_where_its_error_is_less_at_as_many_kicks(monkeypatch):
-    """Other shapes have the best Δt and its terms, Δt in proportion to the kicks; a continued run finds them again."""
-    shapes = trials.SHAPES
-    chosen = law(monkeypatch, lambda x, c: 1e-9 * x**3)
-    monkeypatch.setattr(trials, "SHAPES", shapes)
-    assert chosen == trials.tried_starts(HH, HH.domain, curvature=False)[-1]
-    others = trials.shaped(chosen)
-    mine = [shape for shape in shapes if ("2" in shape[0]) == bool(chosen.curvature)]
-    for best, (levels, _, longer) in zip(others, mine, strict=True):
-        monkeypatch.setattr(
-            trials, "trial", lambda start, *_, best=best: trials.Trial(start, 1e-12 if start == best else 2e-9)
-        )
-        start = trials.chosen_trial(HH, HH.domain).start
-        assert start == best
-        assert best.levels == [int(level) for level in levels.removeprefix("k")][: best.stages]
-        dt = chosen.dt * longer * start.stages / chosen.stages
-        assert start.dt == trials.dividing(dt)
-        assert start in trials.all_starts(HH, HH.domain)
-
-
-def test_among_those_with_nearly_the_least_work_the_best_in_long_runs_is_chosen(monkeypatch):
-    near, best = [], None
-
-    def long_errors(flows, *_):
-        near[:] = flows
-        return [1e-9 if flow == best else 1e-6 for flow in flows]
-
-    monkeypatch.setattr(trials, "trial", lambda start, *_: trials.Trial(start, 1e-9, start))
-    monkeypatch.setattr(trials, "long_errors", long_errors)
-    first = trials.chosen_trial(HH, HH.domain).start
-    assert len(near) == trials.NEAREST
-    assert first == near[0]
-    for best in tuple(near):
-        assert trials.chosen_trial(HH, HH.domain).start == best
-
-
-@pytest.mark.parametrize("unit", [1e-15, 1.0, 1e4])
-def test_steps_divide_round_times(unit):
-    for dt in np.geomspace(0.01, 9.9, 40) * unit:
-        steps = 100 * unit / trials.dividing(dt)
-        assert steps == pytest.approx(round(steps), rel=1e-12)
-        assert abs(np.log2(trials.dividing(dt) / dt)) <= 0.5 + 1e-12
-
-
 def test_the_error_of_long_runs_is_that_of_solve():
     flow = default_primed(PENDULUM).flow(PENDULUM)
     y0, n = states(PENDULUM.domain, trials.ORBITS, SEED, Stream.REFERENCE), trials.LONG
@@ -142,40 +75,6 @@ def test_the_error_of_long_runs_is_that_of_solve():
     sol = solve(PENDULUM, flow, (0.0, t[-1]), y0=y0, t_eval=t, on_domain_exit="ignore")
     expected = np.median(max_energy_error(sol))
     assert trials.long_errors([flow], PENDULUM, PENDULUM.domain) == pytest.approx([expected], rel=1e-6)
-
-
-@pytest.mark.slow
-def test_the_choice_is_the_same_however_slow_the_machine_is(monkeypatch):
-    """Clocks that run at another speed, now faster and now slower, change nothing: no time is measured."""
-    chosen = trials.chosen_trial(PENDULUM, PENDULUM.domain).start
-    random = np.random.default_rng(0)
-    for name in ("perf_counter", "process_time", "thread_time"):
-        clock = getattr(time, name)
-        monkeypatch.setattr(time, name, lambda clock=clock: clock() + 1e4 * random.random())
-    assert trials.chosen_trial(PENDULUM, PENDULUM.domain).start == chosen
-
-
-def test_the_error_of_a_trial_is_that_of_its_orbits(monkeypatch):
-    """A whole fit of the same flow is as near, or nearer by what a longer search finds."""
-    for name, value in QUICK.items():
-        monkeypatch.setattr(trials, name, value)
-    start = replace(default_primed(PENDULUM), stages=2, processor=2)
-    error = trials.trial(start, PENDULUM, PENDULUM.domain).error
-    assert error == trials.trial(start, PENDULUM, PENDULUM.domain).error
-    options = {"restarts": 2, "steps": 20, "points": 40, "label_times": 2, "reference_states": 1, "progress": False}
-    flow = train(PENDULUM, flow=start.flow(PENDULUM), **options)
-    y0, t_span = PENDULUM.domain.sample(20, 1), (0, trials.LENGTH * start.dt)
-    sol = solve(PENDULUM, flow, t_span, y0=y0, on_domain_exit="ignore", backend="array")
-    assert 0.1 < error / np.median(max_energy_error(sol)) < 10
-
-
-def test_a_domain_without_solutions_has_no_trial(monkeypatch):
-    def start(*_, **__):
-        raise ValueError("`domain` holds no states whose solution exists up to `dt`")
-
-    monkeypatch.setattr(TableRun, "prepare", start)
-    assert trials.trial(default_primed(HH), HH, HH.domain).error == np.inf
-    assert trials.chosen_trial(HH, HH.domain).start == default_primed(HH)
 
 
 class Started(Exception):
