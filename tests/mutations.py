@@ -69,19 +69,13 @@ MUTATIONS = (
         "shears of a turn",
         "Y = Y - sigma * X",
         "Y = Y + sigma * X",
-        (
-            "test_the_flow_is_the_matrix_exponential",
-            "test_whole_quarter_turns_leave_no_rounding_to_add_up",
-        ),
+        ("test_the_flow_is_the_matrix_exponential", "test_whole_quarter_turns_leave_no_rounding_to_add_up"),
     ),
     Mutation(
         "filter of the mollified impulse",
         "* times / np.pi)",
         "* times)",
-        (
-            "test_the_order_is_the_slope",
-            "test_fput_figures",
-        ),
+        ("test_the_order_is_the_slope", "test_fput_figures"),
     ),
     Mutation(
         "tableau of Gauss",
@@ -93,19 +87,13 @@ MUTATIONS = (
         "matrix of Newton's method",
         "M = -blocks.reshape(",
         "M = blocks.reshape(",
-        (
-            "test_a_run_is_the_same_in_every_way",
-            "test_first_and_second_derivatives_pass_through_a_step",
-        ),
+        ("test_a_run_is_the_same_in_every_way", "test_first_and_second_derivatives_pass_through_a_step"),
     ),
     Mutation(
         "compensated sum",
         'op("sub", op("sub", total, x), change)',
         'op("add", op("sub", total, x), change)',
-        (
-            "test_compensated_sums_need_compiled_loops_and_lower_the_rounding",
-            "test_compensated_sums_lower_it",
-        ),
+        ("test_compensated_sums_need_compiled_loops_and_lower_the_rounding", "test_compensated_sums_lower_it"),
     ),
     Mutation(
         "time of a secant",
@@ -129,10 +117,7 @@ MUTATIONS = (
         "direction of an event",
         "(up and self.direction >= 0) or (down and self.direction <= 0)",
         "(up and self.direction <= 0) or (down and self.direction >= 0)",
-        (
-            "test_directions",
-            "test_the_results_are_scipys",
-        ),
+        ("test_directions", "test_the_results_are_scipys"),
     ),
     Mutation(
         "inverse of a layer",
@@ -162,10 +147,7 @@ MUTATIONS = (
         "loss of Hamiltonian matching",
         "* (self.scaling.t / self.scaling.action)",
         "* self.scaling.t",
-        (
-            "test_losses_are_the_papers",
-            "test_losses_do_not_depend_on_units",
-        ),
+        ("test_losses_are_the_papers", "test_losses_do_not_depend_on_units"),
     ),
     Mutation(
         "logarithm of the volume",
@@ -189,10 +171,7 @@ MUTATIONS = (
         "states of a sublevel",
         "(self.above - slack < H)",
         "(self.above + slack < H)",
-        (
-            "test_energy_slack_widens_an_energy_domain",
-            "test_compiled_code_agrees_on_what_lies_in_a_sublevel",
-        ),
+        ("test_energy_slack_widens_an_energy_domain", "test_compiled_code_agrees_on_what_lies_in_a_sublevel"),
     ),
 )
 

@@ -9,6 +9,7 @@ import warnings
 import numpy as np
 import pytest
 import sympy as sp
+from conftest import refusals
 from scipy.special import ellipk
 from sympy import cos
 from sympy.physics.mechanics import dynamicsymbols
@@ -100,54 +101,46 @@ def bowl(q):
 ANSWERED = {
     "lambda": (lambda: solve(lambda q, p: p**2), TypeError, r"`system` .* HamiltonianSystem\(hamiltonian=f, ndof=d\)"),
     "factory": (lambda: solve(systems.pendulum), TypeError, r"`system` .* call it, pendulum\(\)"),
-    "no such scene": (lambda: solve("henon"), ValueError, "`system` 'henon' .*Did you mean 'henon-heiles'"),
-    "x, v": (lambda: H("v**2/2 + x**2/2"), ValueError, "q1 … qd and p1 … pd: other names .* q="),
-    "x, px": (lambda: H("px**2/2 + x**2/2"), ValueError, "q1 … qd and p1 … pd: other names .* q="),
-    "P, Q": (lambda: H("P**2/2 + Q**2/2"), ValueError, "q1 … qd and p1 … pd: other names .* q="),
-    "q_1": (lambda: H("p_1**2/2 + q_1**2/2"), ValueError, "q1 … qd and p1 … pd: other names .* q="),
-    "q0": (lambda: H("p0**2/2 + q0**2/2"), ValueError, "q1 … qd and p1 … pd: other names .* q="),
-    "uneven names": (
-        lambda: H("p**2/2", q=["q"], p=["p", "r"]),
-        ValueError,
-        "`q` and `p` must name d",
-    ),
-    "yoshida": (lambda: sympflow.get("yoshida"), ValueError, "'yoshida4' or 'yoshida6'"),
-    "ruth3": (lambda: sympflow.get("ruth3"), ValueError, "'yoshida4'"),
-    "whfast": (lambda: sympflow.get("whfast"), ValueError, "'wisdom_holman'"),
-    "Radau": (lambda: sympflow.get("Radau"), ValueError, "'gauss_legendre6', which is implicit"),
-    "LSODA": (lambda: sympflow.get("LSODA"), ValueError, "'gauss_legendre6', which is implicit"),
-    "kinds": (lambda: sympflow.get("nothing"), ValueError, r"(?s)unknown.*separable H +'verlet'.*Runge–Kutta .*'rk45'"),
+    "no such scene": (lambda: solve("henon"), "`system` 'henon' .*Did you mean 'henon-heiles'"),
+    "x, v": (lambda: H("v**2/2 + x**2/2"), "q1 … qd and p1 … pd: other names .* q="),
+    "x, px": (lambda: H("px**2/2 + x**2/2"), "q1 … qd and p1 … pd: other names .* q="),
+    "P, Q": (lambda: H("P**2/2 + Q**2/2"), "q1 … qd and p1 … pd: other names .* q="),
+    "q_1": (lambda: H("p_1**2/2 + q_1**2/2"), "q1 … qd and p1 … pd: other names .* q="),
+    "q0": (lambda: H("p0**2/2 + q0**2/2"), "q1 … qd and p1 … pd: other names .* q="),
+    "uneven names": (lambda: H("p**2/2", q=["q"], p=["p", "r"]), "`q` and `p` must name d"),
+    "yoshida": (lambda: sympflow.get("yoshida"), "'yoshida4' or 'yoshida6'"),
+    "ruth3": (lambda: sympflow.get("ruth3"), "'yoshida4'"),
+    "whfast": (lambda: sympflow.get("whfast"), "'wisdom_holman'"),
+    "Radau": (lambda: sympflow.get("Radau"), "'gauss_legendre6', which is implicit"),
+    "LSODA": (lambda: sympflow.get("LSODA"), "'gauss_legendre6', which is implicit"),
+    "kinds": (lambda: sympflow.get("nothing"), r"(?s)unknown.*separable H +'verlet'.*Runge–Kutta .*'rk45'"),
     "args": (lambda: solve(H(SPRING), "verlet", y0=[1, 0], args=(1,)), TypeError, "`args` .* `params`"),
     "q0=": (lambda: solve(H(SPRING), "verlet", q0=[1], p0=[0], y0=[1, 0]), TypeError, r"`q0` .*`y0`, \[q, p\]"),
-    "rtol": (
-        lambda: solve(H(SPRING), "verlet", y0=[1, 0], rtol=1e-9),
-        TypeError,
-        "`rtol` .*fixed steps: give",
-    ),
+    "rtol": (lambda: solve(H(SPRING), "verlet", y0=[1, 0], rtol=1e-9), TypeError, "`rtol` .*fixed steps: give"),
     "functions of t": (lambda: H(dynamicsymbols("x") ** 2), TypeError, r"`expression` holds x\(t\): .*q=\[x\]"),
     "tol": (lambda: solve(H(SPRING), "rk45", y0=[1, 0], tol=1e-9), TypeError, "`tol` .*`rtol` and `atol`"),
-    "keyword": (lambda: H("p**2/2 + lambda*q"), ValueError, "lambda is a word of Python"),
-    "2q": (lambda: H("p**2/2 + 2q"), ValueError, r"2q lacks a sign: write 2\*q"),
-    "²": (lambda: H("p²/2"), ValueError, r"² is not understood: write q\*\*2"),
+    "keyword": (lambda: H("p**2/2 + lambda*q"), "lambda is a word of Python"),
+    "2q": (lambda: H("p**2/2 + 2q"), r"2q lacks a sign: write 2\*q"),
+    "²": (lambda: H("p²/2"), r"² is not understood: write q\*\*2"),
     "dimension": (lambda: HamiltonianSystem(lambda q: q**2, dimension=1), TypeError, "are `ndof` of functions"),
-    "H =": (lambda: H("H(q, p) = p**2/2"), ValueError, r"leave 'H\(q, p\) =' out"),
+    "H =": (lambda: H("H(q, p) = p**2/2"), r"leave 'H\(q, p\) =' out"),
     "t_end": (lambda: solve("pendulum", "verlet", t_end=1), TypeError, r"times are `t_span`, \(start, end\)"),
     "n_steps": (lambda: solve("pendulum", "verlet", n_steps=10), TypeError, r"dt=\(t1 - t0\)/n"),
     "times": (lambda: solve("pendulum", "verlet", ts=[0, 1]), TypeError, "times of outputs are `t_eval`"),
     "order": (lambda: solve("pendulum", (0, 1)), TypeError, r"The order is solve\(system, method, t_span, y0\)"),
     "misspelled": (lambda: sympflow.sovle, AttributeError, "Did you mean 'solve'"),
-    "metrics": (lambda: sympflow.compare("pendulum", ["verlet"], (0, 10)), ValueError, "times are `t_span`"),
-    "&": (lambda: H("p**2/2 + Piecewise((q, (q > 0) & (q < 1)), (0, True))"), ValueError, "single comparison: order"),
+    "metrics": (lambda: sympflow.compare("pendulum", ["verlet"], (0, 10)), "times are `t_span`"),
+    "&": (lambda: H("p**2/2 + Piecewise((q, (q > 0) & (q < 1)), (0, True))"), "single comparison: order"),
     "text as potential": (lambda: HamiltonianSystem(SPRING), TypeError, "`potential` .*from_sympy"),
-    "cos q": (lambda: H("p**2/2 - cos q"), ValueError, r"cos q lacks brackets: write cos\(q\)"),
-    "k q": (lambda: H("p**2/2 + k q**2"), ValueError, r"k q lacks a sign: write k\*q"),
-    "|q|": (lambda: H("p**2/2 + |q|"), ValueError, r"write abs\(q\)"),
+    "cos q": (lambda: H("p**2/2 - cos q"), r"cos q lacks brackets: write cos\(q\)"),
+    "k q": (lambda: H("p**2/2 + k q**2"), r"k q lacks a sign: write k\*q"),
+    "|q|": (lambda: H("p**2/2 + |q|"), r"write abs\(q\)"),
     "sol.times": (lambda: solve(SPRING, y0=[1, 0], t_span=(0, 1)).times, AttributeError, "'times': take `t`"),
     "sol.x": (lambda: solve(SPRING, y0=[1, 0], t_span=(0, 1)).x, AttributeError, "'x': take `y`"),
     "system.solve": (lambda: H(SPRING).solve, AttributeError, r"'solve': take sympflow.solve\(system, method"),
     "system.energy": (lambda: H(SPRING).energy, AttributeError, r"'energy': take `hamiltonian\(y\)`"),
     "a state as a list": (lambda: H(SPRING).hamiltonian([1, 0]), TypeError, r"`y` must be an array .* pass np.array"),
-    "q apart from p": (lambda: solve("kepler", y0=([1, 0], [0, 1])), ValueError, "`y0` must .* Join q and p"),
+    "q apart from p": (lambda: solve("kepler", y0=([1, 0], [0, 1])), "`y0` must .* Join q and p"),
     "a solution": (lambda: sympflow.lyapunov(solve(SPRING, y0=[1, 0])), TypeError, "pass its `system`, and its `y0`"),
     "a condition": (
         lambda: solve(SPRING, y0=[1, 0], events=lambda t, y: y[0] > 0),
@@ -155,25 +148,20 @@ ANSWERED = {
         "`events` must return one number .* it returned True",
     ),
     "an event of y": (lambda: solve(SPRING, y0=[1, 0], events=lambda y: y), TypeError, r"Write g\(t, y\)"),
-    "Tsit5": (lambda: sympflow.get("Tsit5"), ValueError, "'dop853'"),
-    "symplectic": (lambda: sympflow.get("symplectic"), ValueError, "'srkn11b', or 'kahan_li8'"),
+    "Tsit5": (lambda: sympflow.get("Tsit5"), "'dop853'"),
+    "symplectic": (lambda: sympflow.get("symplectic"), "'srkn11b', or 'kahan_li8'"),
     "a coordinate of nothing": (
         lambda: H("px**2/2 + x**2/2", q=["x", "y"], p=["px", "py"]),
-        ValueError,
         "`q` and `p` name 'y' and 'py', on which H does not depend",
     ),
-    "q alone": (lambda: H("px**2/2 + x**2/2", q=["x"]), ValueError, r"as in q=\['x', 'y'\], p=\['px', 'py'\]"),
-    "RK23": (lambda: sympflow.get("RK23"), ValueError, "'rk45'"),
-    "mercurius": (lambda: sympflow.get("mercurius"), ValueError, "'dop853' with `rtol`"),
-    "y0 turned": (lambda: solve("pendulum", y0=np.ones((2, 5))), ValueError, r"got \(2, 5\). Transpose it"),
+    "q alone": (lambda: H("px**2/2 + x**2/2", q=["x"]), r"as in q=\['x', 'y'\], p=\['px', 'py'\]"),
+    "RK23": (lambda: sympflow.get("RK23"), "'rk45'"),
+    "mercurius": (lambda: sympflow.get("mercurius"), "'dop853' with `rtol`"),
+    "y0 turned": (lambda: solve("pendulum", y0=np.ones((2, 5))), r"got \(2, 5\). Transpose it"),
     "sympflow.plotting": (lambda: sympflow.plotting, AttributeError, "plots are methods of results"),
     "sympflow.chaos": (lambda: sympflow.chaos, AttributeError, "take lyapunov, sali"),
-    "a function as text": (
-        lambda: H(len),
-        ValueError,
-        r"of a function make HamiltonianSystem\(hamiltonian=f, ndof=d\)",
-    ),
-    "no ndof": (lambda: HamiltonianSystem(len), ValueError, r"as in HamiltonianSystem\(V, ndof=2\)"),
+    "a function as text": (lambda: H(len), r"of a function make HamiltonianSystem\(hamiltonian=f, ndof=d\)"),
+    "no ndof": (lambda: HamiltonianSystem(len), r"as in HamiltonianSystem\(V, ndof=2\)"),
     "Trajectories(t, y)": (
         lambda: sympflow.Trajectories(ran().t, ran().y),
         TypeError,
@@ -200,7 +188,7 @@ ANSWERED = {
         r"`q` must be an array or a tensor, positions; got 1.0",
     ),
     "H of a solution": (lambda: H(SPRING).hamiltonian(ran()), TypeError, "got Solution: pass .*`sol.states`"),
-    "H of sol.y": (lambda: H(SPRING).hamiltonian(ran().y), ValueError, "Of a solution pass `sol.states`"),
+    "H of sol.y": (lambda: H(SPRING).hamiltonian(ran().y), "Of a solution pass `sol.states`"),
     "kepler(mu=)": (lambda: systems.kepler(mu=2), TypeError, r"`mu` .*kepler\(\), which takes e: write your own H"),
     "fput_beta(N=)": (lambda: systems.fput_beta(N=9), TypeError, "`N` .* takes n, beta, amplitude: did you mean `n`"),
     "pendulum(dt=)": (lambda: systems.pendulum(dt=0.1), TypeError, r"which takes none: pass it to solve\(\)"),
@@ -221,64 +209,35 @@ ANSWERED = {
     "from_sympy(tspan=)": (lambda: H(SPRING, tspan=1), TypeError, "did you mean `t_span`"),
     "any case": (lambda: systems.Kepler, AttributeError, "Did you mean 'kepler'"),
     "system.train": (lambda: H(SPRING).train, AttributeError, r"take sympflow.train\(system\)"),
-    "y0 of a formula": (
-        lambda: solve(SPRING, y0=[1, 0, 0]),
-        ValueError,
-        r"for 'H = p1\*\*2/2 \+ q1\*\*2/2', \[q, p\] with 1 each",
-    ),
+    "y0 of a formula": (lambda: solve(SPRING, y0=[1, 0, 0]), r"for 'H = p1\*\*2/2 \+ q1\*\*2/2', \[q, p\] with 1 each"),
     "a flow without its system": (
         lambda: sympflow.shipped_flows("pendulum")[0].load().plot(),
-        ValueError,
         "`system` is needed, whose H bounds the domain .*load the flow with it",
     ),
-    "f.pt": (lambda: sympflow.shipped_flows("pendulum")[0].load().save("f.pt"), ValueError, "call it f.safetensors"),
+    "f.pt": (lambda: sympflow.shipped_flows("pendulum")[0].load().save("f.pt"), "call it f.safetensors"),
     "a list of elements": (
         lambda: HamiltonianSystem.planets([1, 0.1], elements=[{"a": 1}]),
-        ValueError,
         r"`elements` must give a, .* as in \{'a': \[...\], 'e'",
     ),
     "Box(low)": (lambda: sympflow.Box([-1, -1]), TypeError, r"^`high` is missing: give it, Box\(low, high\)"),
-    "pairs by place": (
-        lambda: HamiltonianSystem.pairs("-1/r", [1, 1]),
-        TypeError,
-        r"pairs\(\) .*: write masses=",
-    ),
+    "pairs by place": (lambda: HamiltonianSystem.pairs("-1/r", [1, 1]), TypeError, r"pairs\(\) .*: write masses="),
     "pairs(mass=)": (lambda: HamiltonianSystem.pairs("-1/r", mass=[1, 1]), TypeError, "did you mean `masses`"),
-    "pairs without masses": (
-        lambda: HamiltonianSystem.pairs("-1/r"),
-        TypeError,
-        r"pairs\(potential, masses=…\)",
-    ),
-    "from_sympy by place": (
-        lambda: H(SPRING, [1, 0]),
-        TypeError,
-        r"of from_sympy\(\) after `expression` are",
-    ),
+    "pairs without masses": (lambda: HamiltonianSystem.pairs("-1/r"), TypeError, r"pairs\(potential, masses=…\)"),
+    "from_sympy by place": (lambda: H(SPRING, [1, 0]), TypeError, r"of from_sympy\(\) after `expression` are"),
     "to_csv()": (lambda: compared().to_csv(), TypeError, r"^`path` is missing: give it, to_csv\(path\)"),
     "report[0]": (lambda: compared()[0], TypeError, r"has no item 0: take `rows`, as in report.rows\[0\]"),
     "report.save": (lambda: compared().save, AttributeError, r"take `table\(\)`, `to_csv\(path\)`"),
-    "system.y0 =": (
-        lambda: setattr(H(SPRING), "y0", [1, 0]),
-        AttributeError,
-        r"^`y0` .* system.with_scene\(y0=…\)",
-    ),
+    "system.y0 =": (lambda: setattr(H(SPRING), "y0", [1, 0]), AttributeError, r"^`y0` .* system.with_scene\(y0=…\)"),
     "system.params =": (lambda: setattr(H(SPRING), "params", {}), AttributeError, r"^`params` .* system.with_params\("),
     "system.force =": (lambda: setattr(H(SPRING), "force", len), AttributeError, "^`force` .* make a system with it"),
-    "qdot": (lambda: H("qdot**2/2 + q**2/2"), ValueError, "function of momenta: if qdot is a velocity q', write p"),
-    "no such file": (lambda: solve("nowhere.py:morse"), ValueError, "^`system` 'nowhere.py': there is no such file"),
-    "of functions": (
-        lambda: solve(HamiltonianSystem(bowl, ndof=1)),
-        ValueError,
-        "`y0` is needed: V = bowl has no",
-    ),
+    "qdot": (lambda: H("qdot**2/2 + q**2/2"), "function of momenta: if qdot is a velocity q', write p"),
+    "no such file": (lambda: solve("nowhere.py:morse"), "^`system` 'nowhere.py': there is no such file"),
+    "of functions": (lambda: solve(HamiltonianSystem(bowl, ndof=1)), "`y0` is needed: V = bowl has no"),
     "scene": (lambda: systems.henon, AttributeError, "Did you mean 'henon_heiles'"),
 }
 
 
-@pytest.mark.parametrize(("call", "kind", "answer"), ANSWERED.values(), ids=ANSWERED)
-def test_the_answer_names_the_remedy(call, kind, answer):
-    with pytest.raises(kind, match=answer):
-        call()
+test_the_answer_names_the_remedy = refusals(*ANSWERED.values(), ids=ANSWERED)
 
 
 def test_a_solution_without_dense_output_has_none_as_in_scipy():
@@ -338,8 +297,7 @@ def test_a_flow_of_a_system_without_a_domain_is_trained_around_its_orbit():
 
 
 @pytest.mark.parametrize(
-    ("function", "title"),
-    [(sympflow.lyapunov, "Lyapunov exponent"), (sympflow.sali, "SALI"), (sympflow.gali, "GALI")],
+    ("function", "title"), [(sympflow.lyapunov, "Lyapunov exponent"), (sympflow.sali, "SALI"), (sympflow.gali, "GALI")]
 )
 def test_indicators_are_shown_by_their_names(function, title):
     assert repr(function("henon-heiles", "verlet", (0, 1))).startswith(f"{title}\n")

@@ -2,13 +2,11 @@
 
 import pickle
 import re
-import tracemalloc
 
 import numpy as np
 import pytest
 import torch
 
-import sympflow
 from sympflow import Box, HamiltonianSystem, get, solve, systems
 from sympflow.kernels.explicit_loops import compiled_field
 from sympflow.schemes import SCHEMES
@@ -47,17 +45,6 @@ def test_the_last_step_is_shorter():
     sol = solve(PENDULUM, "verlet", (0, 1), dt=0.3)
     step = get("verlet")().step
     np.testing.assert_array_equal(sol.y[:, -1], step(PENDULUM, 0.0, sol.y[:, -2], 1.0 - 3 * 0.3))
-
-
-def test_a_million_steps_store_what_was_asked_for():
-    solve(PENDULUM, "verlet", (0, 1), dt=1e-2)
-    tracemalloc.start()
-    sol = solve(PENDULUM, "verlet", (0, 1e4), dt=1e-2, t_eval=np.linspace(0, 1e4, 11))
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert sol.stats["n_steps"] == 1_000_000
-    assert sol.y.shape == (2, 11)
-    assert peak < 2e6  # storing every state would take 16 MB
 
 
 # failure ------------------------------------------------------------------------------------------
@@ -189,14 +176,6 @@ def test_options_that_are_no_real_numbers(option, value):
             solve(PENDULUM, method, (0, 1), [1.0, 0.0], **arguments)
 
 
-def test_a_first_step_beyond_the_interval():
-    for t_span in ((0, 5), (5, 0)):
-        with pytest.raises(ValueError, match=r"^`first_step` 5.5 exceeds the interval, of length 5"):
-            solve(HH, "rk45", t_span, first_step=5.5)
-        assert solve(HH, "rk45", t_span, first_step=5.0).success
-    assert solve(HH, "rk45", (2, 2), first_step=5.0).success
-
-
 @pytest.mark.parametrize("method", ["verlet", "sympflow", "gauss_legendre4", "rk4", "dopri5", "log_leapfrog"])
 def test_a_run_that_ends_with_its_last_output_says_so(method):
     """The end of `t_span` is not reached, which for this orbit of the escape could not be."""
@@ -241,25 +220,3 @@ def test_solution_has_the_fields_of_scipy():
     np.testing.assert_array_equal(np.concatenate([ours.q, ours.p]), ours.y)
     with pytest.raises(ValueError, match=r"^`solution` is a batch"):
         solve(PENDULUM, "verlet", (0, 1), y0=[[1.0, 0.0]]).to_scipy()
-
-
-def test_general_kinetic_energies():
-    masses = HamiltonianSystem.from_sympy("p1**2/4 + p1*p2/5 + p2**2/6 + q1**4 + q1*q2 + q2**2", y0=[1, 0, 0, 1])
-    relativistic = HamiltonianSystem.from_sympy("sqrt(1 + p**2) + q**4", y0=[1, 0.5])
-    for system, method, close in (
-        (masses, "kahan_li8", 1e-9),
-        (masses, "srkn11b", 1e-8),
-        (relativistic, "kahan_li8", 1e-9),
-    ):
-        reference = solve(system, "dop853", (0, 3), t_eval=[3.0], rtol=1e-12, atol=1e-13).y
-        sol = solve(system, method, (0, 3), t_eval=[3.0], backend="array")
-        np.testing.assert_allclose(sol.y, reference, rtol=0, atol=close)
-    with pytest.raises(ValueError, match=r"^`method` 'srkn11b' needs a kinetic energy"):
-        solve(relativistic, "srkn11b")
-
-
-def test_y0_may_be_a_parameter_of_torch():
-    y0 = torch.nn.Parameter(torch.tensor([0.5, 0.3], dtype=torch.float64))
-    sol = sympflow.solve(sympflow.systems.pendulum(), "verlet", (0.0, 1.0), y0, t_eval=[0.33, 1.0])
-    sol.y.sum().backward()
-    assert torch.isfinite(y0.grad).all()

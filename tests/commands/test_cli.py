@@ -2,7 +2,6 @@
 
 import csv
 import json
-import os
 import re
 import subprocess
 import sys
@@ -12,10 +11,8 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from sympflow import get
 from sympflow.commands import app
 from sympflow.commands.console import in_options
-from sympflow.commands.words import method, scenes
 
 FAST = ["--t-end", "5", "--n-outputs", "40", "--repeats", "1"]
 
@@ -58,23 +55,6 @@ def test_compare_writes_a_table_figures_and_files(tmp_path):
         "comparison.png",
         *(f"henon-heiles-{kind}.png" for kind in ("error", "energy", "volume", "portrait")),
     }
-
-
-@pytest.mark.slow
-def test_compare_takes_several_systems_with_their_parameters(tmp_path):
-    words = ["harmonic-oscillator", "harmonic-oscillator:omega=10:t_end=1", "stiff-oscillator", "--methods", "verlet"]
-    result = run("compare", *words, "--metrics", "energy", *FAST, "--out", tmp_path)
-    assert result.exit_code == 0, result.output
-    with (tmp_path / "comparison.csv").open() as file:
-        found = [row["system"] for row in csv.DictReader(file)]
-    assert found == [f"harmonic_oscillator(omega={omega})" for omega in (1, 10, 100)]
-    assert (tmp_path / "harmonic-oscillator-omega=10.csv").exists()
-
-
-def test_solve_without_a_flow_names_a_method_that_needs_none():
-    result = run("solve", "harmonic-oscillator", "--omega", "10", "--method", "sympflow")
-    assert result.exit_code == 2
-    assert "or take a method that needs none, such as gauss_legendre6." in " ".join(result.output.split())
 
 
 def test_compare_survives_methods_that_do_not_apply_but_fails_if_none_does():
@@ -120,22 +100,6 @@ def test_solve_goes_on_from_a_store_to_a_later_end(tmp_path):
     assert "21 outputs in" in " ".join(later.output.split()), later.output
 
 
-def test_solve_that_fails_ends_with_status_one():
-    result = run("solve", "henon-heiles", "--method", "verlet", "--y0", "0,0,0,0.7", "--t-end", 20)
-    assert result.exit_code == 1
-    assert "became non-finite after t = 5." in result.output
-
-
-def test_solve_takes_the_flow_by_default_and_either_spelling_of_a_system():
-    result = run("solve", "henon_heiles", "--t-end", 5)
-    assert result.exit_code == 0, result.output
-    final = [line for line in result.output.splitlines() if line.startswith("y(5) = ")]
-    assert final[0] in run("solve", "henon-heiles", "--method", "sympflow", "--t-end", 5).output
-    one, other = scenes(["henon_heiles", "harmonic_oscillator:omega=3"])
-    assert one.key == "henon-heiles"
-    assert other.key == "harmonic-oscillator-omega=3"
-
-
 @pytest.mark.parametrize("command", ["solve", "compare", "bench", "train"])
 def test_an_output_that_cannot_be_written_is_refused_before_anything_is_computed(command, tmp_path, monkeypatch):
     computed = []
@@ -168,17 +132,6 @@ def test_missing_matplotlib_is_reported_before_anything_is_computed(command, tmp
     assert result.exit_code == 1
     assert 'pip install matplotlib, or in the clone of sympflow pip install ".[plot]"' in result.stderr
     assert not computed
-
-
-@pytest.mark.slow
-def test_a_blow_up_prints_no_warnings_of_numpy(tmp_path):
-    words = ["henon-heiles", "--y0", "0,0,0,0.7", "--methods", "verlet,rk45", "--t-end", "20", "--repeats", "1"]
-    code = "from sympflow.cli import main; main()"
-    words = ["compare", *words, "--out", str(tmp_path)]
-    result = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, check=False)
-    assert result.returncode == 1
-    assert "Warning" not in result.stderr
-    assert "inf" in result.stdout
 
 
 @pytest.mark.parametrize(
@@ -276,38 +229,6 @@ def test_learn_reads_what_was_observed(observed, columns, velocities, tmp_path, 
     assert np.isnan(read[0].runs[0].y[1]).all() == (observed == "q")
 
 
-def test_flows_are_listed():
-    everything = run("flows").stdout
-    assert "henon_heiles-sympflow" in everything
-    own = run("flows", "harmonic-oscillator", "--omega", 100).stdout
-    assert "harmonic_oscillator_100-sympflow" in own
-    assert "henon_heiles" not in own
-
-
-@pytest.mark.slow
-def test_train_writes_a_flow_that_solve_takes(tmp_path):
-    path = tmp_path / "flow.safetensors"
-    small = ["--pairs", 1, "--hidden", "4", "--epochs", 3, "--points", 40, "--seed", 1, "--dt", 0.2]
-    result = run("train", "pendulum", *small, "--out", path, "--checkpoint", tmp_path / "run.pt")
-    assert result.exit_code == 0, result.output
-    assert "one step error" in result.output
-    assert run("train", "pendulum", *small, "--out", path, "--resume", tmp_path / "run.pt").exit_code == 0
-    result = run("solve", "pendulum", "--method", path, "--t-end", 1, "--out", tmp_path / "y.csv")
-    assert result.exit_code == 0, result.output
-    assert len((tmp_path / "y.csv").read_text().splitlines()) == 7
-    result = run("compare", "pendulum", "--methods", f"{path},verlet", *FAST)
-    assert result.exit_code == 0
-    assert "flow  " in result.output
-
-
-def test_parameters_reach_the_system():
-    one, other = scenes(["harmonic-oscillator", "pendulum", "--omega=4"])
-    assert one.system.params == {"omega": 4.0}
-    assert one.key == "harmonic-oscillator-omega=4"
-    assert other.system.params == {}
-    assert method("verlet:dt=0.1")[1].dt == 0.1
-
-
 def test_a_run_that_is_too_long_names_options_that_there_are():
     result = run("solve", "pendulum", "--method", "verlet", "--t-end", 1e9)
     assert result.exit_code == 2
@@ -322,11 +243,6 @@ def test_a_run_that_stops_says_what_to_raise_in_options():
     result = run("solve", "pendulum", "--method", "dopri5:max_num_steps=3")
     assert result.exit_code == 1
     assert "or end `--t-end` earlier" in result.stdout
-
-
-def test_systems_of_one_name_do_not_overwrite_their_files():
-    keys = [scene.key for scene in scenes(["pendulum:t_end=1", "henon-heiles", "pendulum", "pendulum"])]
-    assert keys == ["pendulum", "henon-heiles", "pendulum-2", "pendulum-3"]
 
 
 def test_a_backticked_argument_is_the_option_of_the_command_that_runs():
@@ -350,21 +266,6 @@ def test_a_backticked_argument_is_the_option_of_the_command_that_runs():
     app.command()(command)
     assert CliRunner().invoke(app, []).exit_code == 0
     assert in_options(said, contexts[0]) == here
-
-
-def test_quiet_prints_errors_alone(tmp_path):
-    words = ("solve", "pendulum", "--method", "verlet", "--t-end", 1, "--out", tmp_path / "y.csv")
-    quiet = run(*words, "--quiet")
-    assert (quiet.exit_code, quiet.output) == (0, "")
-    assert (tmp_path / "y.csv").exists()
-    assert "outputs" in run(*words).stdout  # it is not kept for the next command
-    for command in (("compare", "--metrics", "energy", *FAST), ("section", "--t-end", 5), ("flows",), ("systems",)):
-        names = () if command[0] == "systems" else ("pendulum",)
-        methods = {"compare": ("--methods", "verlet"), "section": ("--method", "verlet")}.get(command[0], ())
-        assert run(command[0], *names, *methods, *command[1:], "-q").output == ""
-    refused = run("solve", "pendulum", "--method", "vertel", "-q")
-    assert refused.stdout == ""
-    assert "Did you mean 'verlet'" in refused.stderr
 
 
 def test_a_section_is_printed_and_written(tmp_path):
@@ -411,37 +312,11 @@ def test_the_shell_completes_systems_methods_and_flows(words, expected, tmp_path
     assert set(result.stdout.split()) == expected
 
 
-def test_each_source_is_that_of_the_method():
-    sources = {name: get(name).summary() for name in ("verlet", "impulse", "mollified_impulse", "linear_srkn11b")}
-    assert [name for name, source in sources.items() if "1967" in source] == ["verlet"]
-    assert "Tuckerman" in sources["impulse"]
-    assert "Grubmüller" in sources["impulse"]
-    assert "Mikkola" in get("log_kahan_li8").summary()
-    assert "exact linear flow" in sources["linear_srkn11b"]
-    assert all("Sanz-Serna" in get(f"gauss_legendre{order}").summary() for order in (4, 6, 8))
-
-
-def test_help_has_examples():
-    for command in ("solve", "compare", "bench", "stability", "section", "train", "certificate"):
-        result = run(command, "--help")
-        assert result.exit_code == 0
-        assert f"sympflow {command} " in result.output
-
-
 def test_without_the_extra_the_message_says_what_to_install():
     code = "import sys; sys.modules['typer'] = None; from sympflow.cli import main; main()"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert result.returncode == 1
     assert 'pip install ".[cli]"' in result.stderr
-
-
-@pytest.mark.slow
-def test_bench_writes_the_diagram(tmp_path):
-    words = ["pendulum", "--methods", "verlet,kahan_li8", "--t-end", 5, "--batch", 5, "--n-outputs", 5, "--repeats", 1]
-    result = run("bench", *words, "--out", tmp_path)
-    assert result.exit_code == 0, result.output
-    assert "For an energy error of" in result.output
-    assert {p.suffix for p in tmp_path.glob("pendulum-work-precision*")} == {".csv", ".json", ".png"}
 
 
 def test_solve_takes_a_tolerance():
@@ -463,18 +338,6 @@ def test_solve_takes_a_formula_and_the_values_of_its_symbols():
     missing = run("solve", "p**2/2 + k*q**4/4", "--y0", "1,0")
     assert missing.exit_code == 2
     assert "`--k` is missing" in missing.output
-
-
-@pytest.mark.parametrize("locale", [{"PYTHONIOENCODING": "ascii"}, {"LC_ALL": "C", "PYTHONUTF8": "0"}], ids=str)
-def test_the_command_line_writes_utf_8(locale, tmp_path):
-    env = os.environ | {"PYTHONCOERCECLOCALE": "0", "PYTHONPATH": os.pathsep.join(filter(None, sys.path))} | locale
-    words = ["compare", "pendulum", "--methods", "verlet", "--t-end", "1", "--out", str(tmp_path)]
-    for call in (words, ["methods"]):
-        ended = subprocess.run([sys.executable, "-m", "sympflow.cli", *call], capture_output=True, check=False, env=env)
-        assert ended.returncode == 0, ended.stderr
-        text = ended.stdout.decode("utf-8")
-        assert not text.isascii() or call[0] == "methods"
-    assert (tmp_path / "pendulum.csv").read_text(encoding="utf-8").startswith("system,")
 
 
 ANSWERED = {
