@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -219,7 +219,7 @@ def linear_part(system: Any) -> LinearPart:
     elif system.local is not None:
         return system.local.linear_and_rest(_interval(system))[0]
     elif system.written is not None:
-        part = read_off(system.written.H, system.written.q, system.written.p, _interval(system))
+        part = read_off(form_of_parts(system), _interval(system))
     else:
         raise ValueError(
             f"`system` {system.name!r} is given by functions, whose linear part is not known: pass "
@@ -269,14 +269,27 @@ def _interval(system: Any) -> float:
     return abs(system.t_span[1] - system.t_span[0])
 
 
-def read_off(
-    H: sp.Expr, q: tuple[sp.Symbol, ...], p: tuple[sp.Symbol, ...], interval: float = 0.0
+def form_of_parts(system: Any) -> Any:
+    """H with symbols for what depends on parameters alone, where it does not depend on t."""
+    return system.written.parametric if system.autonomous else system.written
+
+
+def read_off(form: Any, interval: float = 0.0) -> LinearPart | None:
+    """The quadratic terms of a symbolic H, by the values of its parameters, or None if its potential has none."""
+    import sympy as sp
+
+    quadratic, rest = quadratic_terms(form.H, (*form.q, *form.p))
+    values = dict(zip(form.parameters, map(sp.Float, form.values), strict=True))
+    return _read_off(quadratic.xreplace(values), rest, form.q, form.p, interval)
+
+
+@lru_cache(maxsize=64)
+def _read_off(
+    quadratic: sp.Expr, rest: sp.Expr, q: tuple[sp.Symbol, ...], p: tuple[sp.Symbol, ...], interval: float
 ) -> LinearPart | None:
-    """The quadratic terms of a symbolic H, or None if its potential has none."""
     import sympy as sp
 
     d = len(q)
-    quadratic, rest = quadratic_terms(H, (*q, *p))
     B, K = sp.hessian(quadratic, p), sp.hessian(quadratic, q)
     # a coordinate takes part if its momentum enters H by the quadratic terms alone
     active = [i for i in range(d) if any(b != 0 for b in B.row(i)) and not rest.has(p[i])]
@@ -320,6 +333,7 @@ def _number(value: float) -> Any:
     return sp.Integer(int(value)) if float(value).is_integer() else sp.Float(value)
 
 
+@lru_cache(maxsize=64)
 def quadratic_terms(H: sp.Expr, variables: tuple[sp.Symbol, ...]) -> tuple[sp.Expr, sp.Expr]:
     """H as polynomial terms of degree 2 or less and the rest; a term that has none of them is left as it is written.
 
@@ -342,15 +356,12 @@ def quadratic_terms(H: sp.Expr, variables: tuple[sp.Symbol, ...]) -> tuple[sp.Ex
 
 
 def _degree(term: sp.Expr, variables: tuple[sp.Symbol, ...]) -> float:
-    """Total degree of a monomial; infinite for other expressions."""
-    if not term.free_symbols:
-        return 0
-    powers = term.as_powers_dict()
+    """Total degree of a monomial in these; infinite for other expressions."""
     degree = 0
-    for base, exponent in powers.items():
+    for base, exponent in term.as_powers_dict().items():
         if base in variables and exponent.is_Integer and exponent > 0:
             degree += int(exponent)
-        elif base.free_symbols or exponent.free_symbols:
+        elif not {*variables}.isdisjoint(base.free_symbols | exponent.free_symbols):
             return np.inf
     return degree
 

@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,6 +22,7 @@ from sympflow.hamiltonian.linear_part import (
     LinearPart,
     RestOfPotential,
     check_parts_conservative,
+    form_of_parts,
     linear_part,
     read_off,
 )
@@ -71,8 +72,12 @@ class PartFunctions(SymbolicHamiltonian):
         self.separable = False
         self.of_positions = not H.has(*p)  # once, for torch cannot follow SymPy
         self.time = whole.time if whole.time in H.free_symbols else None
+        self.parameters, self.values = whole.parameters, whole.values
         if whole.samples:
             self.samples = whole.samples
+
+    def _derivative(self, name: str, order: int) -> Callable[..., Array]:
+        return partial(super()._derivative(name, order), numbers=self.values)
 
     def hessian_vector(self, y: Array, v: Array, *t: Any) -> Array:
         """∇²_q H_k(y)·v: (..., 2d), (..., d) to (..., d)."""
@@ -348,17 +353,13 @@ def exact_parts(system: HamiltonianSystem, expressions: Sequence[str] | None = N
 
 
 def _detected(system: HamiltonianSystem) -> ExactParts:
-    import sympy as sp
-
-    symbols = system.written
+    symbols = form_of_parts(system)
     try:
         linear = linear_part(system)
         rest = linear.potential
     except ValueError:
         linear, rest = None, symbols.H
-    if _groups(rest, symbols) is None:
-        rest = sp.expand(rest)
-    groups = _groups(rest, symbols)
+    groups = _groups(rest, symbols.q, symbols.p)
     if groups is None:
         raise ValueError(
             f"`system` {system.name!r} does not split into parts that are solved exactly: a term holds a coordinate "
@@ -368,28 +369,31 @@ def _detected(system: HamiltonianSystem) -> ExactParts:
     return ExactParts(linear, sorted(rest, key=lambda part: not part.of_positions), system.ndof)
 
 
-def _groups(H: sp.Expr, symbols: SymbolicHamiltonian) -> list[sp.Expr] | None:
-    """The terms of H in as few groups without conjugate pairs as come about greedily, or None."""
+@lru_cache(maxsize=64)
+def _groups(H: sp.Expr, q: tuple[sp.Symbol, ...], p: tuple[sp.Symbol, ...]) -> list[sp.Expr] | None:
+    """The terms of H in as few groups without conjugate pairs as come about greedily, expanded if need be, or None."""
     import sympy as sp
 
-    groups: list[tuple[set[sp.Symbol], list[sp.Expr]]] = []
-    states = {*symbols.q, *symbols.p}
-    terms = [t for t in sp.Add.make_args(H) if t.free_symbols & states]
-    for term in sorted(terms, key=lambda t: -len(t.free_symbols)):
-        if _has_pair(term.free_symbols, symbols):
-            return None
-        for variables, members in groups:
-            if not _has_pair(variables | term.free_symbols, symbols):
-                variables.update(term.free_symbols)
-                members.append(term)
-                break
-        else:
-            groups.append((set(term.free_symbols), [term]))
-    return [sp.Add(*members) for _, members in groups]
+    for f in (H, sp.expand(H)):
+        groups: list[tuple[set[sp.Symbol], list[sp.Expr]]] = []
+        terms = [(t.free_symbols & {*q, *p}, t) for t in sp.Add.make_args(f)]
+        for found, term in sorted(terms, key=lambda each: -len(each[0])):
+            if not found:
+                continue
+            for variables, members in groups:
+                if not _has_pair(variables | found, q, p):
+                    variables.update(found)
+                    members.append(term)
+                    break
+            else:
+                groups.append((set(found), [term]))
+        if not any(_has_pair(variables, q, p) for variables, _ in groups):
+            return [sp.Add(*members) for _, members in groups]
+    return None
 
 
-def _has_pair(variables: set[sp.Symbol], symbols: SymbolicHamiltonian) -> bool:
-    return any(q in variables and p in variables for q, p in zip(symbols.q, symbols.p, strict=True))
+def _has_pair(variables: set[sp.Symbol], q: Sequence[sp.Symbol], p: Sequence[sp.Symbol]) -> bool:
+    return any(a in variables and b in variables for a, b in zip(q, p, strict=True))
 
 
 def _given(system: HamiltonianSystem, expressions: tuple[str, ...]) -> ExactParts:
@@ -410,11 +414,12 @@ def _given(system: HamiltonianSystem, expressions: tuple[str, ...]) -> ExactPart
     rest: list[PartFunctions] = []
     sequence = []
     for expression, part in zip(expressions, parts, strict=True):
-        if not _has_pair(part.free_symbols, symbols):
+        if not _has_pair(part.free_symbols, symbols.q, symbols.p):
             rest.append(PartFunctions(part, symbols.q, symbols.p, symbols))
             sequence.append(len(rest))
             continue
-        candidate = read_off(part, symbols.q, symbols.p, abs(system.t_span[1] - system.t_span[0]))
+        held = PartFunctions(part, symbols.q, symbols.p, symbols)
+        candidate = read_off(held, abs(system.t_span[1] - system.t_span[0]))
         if linear is not None or candidate is None or getattr(candidate.potential, "free_symbols", None):
             raise ValueError(
                 f"`parts` has {expression!r}, which is not solved exactly: it holds a coordinate and its momentum and "
@@ -510,19 +515,26 @@ def two_copies(system: HamiltonianSystem, omega: float | None) -> ExactParts:
             "`omega`, or the system one of these."
         )
     check_parts_conservative(system)
-    import sympy as sp
-
-    d, symbols = system.ndof, system.written
+    d = system.ndof
     squares = np.diag(natural_scale(system) ** 2)
     B, K = (omega * np.block([[one, -one], [-one, one]]) for one in (np.linalg.inv(squares), squares))
     coupling = Coupling(B, K, np.zeros(2 * d))
-    if symbols is None:
+    if system.written is None:
         return ExactParts(coupling, [FunctionsOfCopies(system, first) for first in (True, False)], 2 * d)
-    q, p = (tuple(sp.symbols(f"{letter}1:{2 * d + 1}", real=True)) for letter in "qp")
-    first = dict(zip((*symbols.q, *symbols.p), (*q[:d], *p[d:]), strict=True))
-    second = dict(zip((*symbols.q, *symbols.p), (*q[d:], *p[:d]), strict=True))
-    copies = [PartFunctions(symbols.H.xreplace(these), q, p, symbols) for these in (first, second)]
-    return ExactParts(coupling, copies, 2 * d)
+    symbols = form_of_parts(system)
+    q, p, copies = _copies(symbols.H, symbols.q, symbols.p)
+    return ExactParts(coupling, [PartFunctions(H, q, p, symbols) for H in copies], 2 * d)
+
+
+@lru_cache(maxsize=64)
+def _copies(H: sp.Expr, q: tuple[sp.Symbol, ...], p: tuple[sp.Symbol, ...]) -> tuple[Any, Any, list[sp.Expr]]:
+    """The symbols of two copies, and H of the positions of one and the momenta of the other."""
+    import sympy as sp
+
+    d = len(q)
+    Q, P = (tuple(sp.symbols(f"{letter}1:{2 * d + 1}", real=True)) for letter in "qp")
+    pairs = (*Q[:d], *P[d:]), (*Q[d:], *P[:d])
+    return Q, P, [H.xreplace(dict(zip((*q, *p), these, strict=True))) for these in pairs]
 
 
 def both(y: Array, d: int) -> Array:

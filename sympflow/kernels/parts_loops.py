@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
-from functools import cache, cached_property, partial
+from functools import cache, cached_property, lru_cache, partial
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -23,7 +24,7 @@ from sympflow.compiler.program import Program, gradient, tangent, traced
 from sympflow.hamiltonian.formulas import evaluator
 from sympflow.hamiltonian.parts import LINEAR, ExactParts, PartFunctions, SubFlow, shears
 from sympflow.kernels.protocol import Batch, Kernel, Run, Steps, Task, begun_in, run_states
-from sympflow.kernels.rollouts import Columns, Rollouts
+from sympflow.kernels.rollouts import Columns, Rollouts, shared
 from sympflow.kernels.runs import Numbers, begun, finished
 from sympflow.kernels.stage_times import SymbolicLetters
 from sympflow.kernels.terms import MOST_IN_REGISTERS, written_out
@@ -50,12 +51,43 @@ Maps = Callable[[np.ndarray], Sequence[SubFlow]]
 """The maps of a step of length h (...), their entries of that batch shape."""
 
 
+class Scales:
+    """The matrices of the modes by rows, each a scale, which is a number of tables, times what is part of the code.
+
+    So the couplings and modes that differ in their scales alone share their code. `named` are the scales, the centre,
+    the masses of the modes and the values of parameters, those that are neither 0 nor 1.
+    """
+
+    def __init__(self, parts: ExactParts) -> None:
+        self.C, C_scales = _scaled(parts.C)
+        self.inverse, inverse_scales = _scaled(parts.inverse_C.T)
+        rates = parts.inverse_masses(np.zeros(parts.ndof)) if parts.has_force_gradient else np.zeros(parts.ndof)
+        known = {"center": parts.center, "scale": C_scales, "inverse": inverse_scales, "rate": rates}
+        self.values = {f"{name}_{i}": float(x) for name, row in known.items() for i, x in enumerate(row)}
+        for part in parts.rest:
+            self.values |= {s.name: x for s, x in zip(part.parameters, part.values, strict=True)}
+        self.named = {name: x for name, x in self.values.items() if x not in (0.0, 1.0)}
+        alike = tuple(sorted((name, self.values[name]) for name in self.values.keys() - self.named.keys()))
+        self.key = self.C.tobytes(), self.inverse.tobytes(), alike, tuple(self.named)
+
+    def row(self, name: str, known: dict[str, Any]) -> list[Any]:
+        """The numbers of a name, of each mode."""
+        return [known.get(f"{name}_{i}", self.values[f"{name}_{i}"]) for i in range(len(self.C))]
+
+
+def _scaled(C: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A matrix with rows whose largest entry is 1, up to its sign, and the scales of these."""
+    scales = np.abs(C).max(1)
+    return C / scales[:, None], scales
+
+
 class PartMaps:
     """The maps of the parts of a symbolic system as code, with `filters` if they have some."""
 
-    def __init__(self, parts: ExactParts, filters: bool) -> None:
-        self.parts, self.ndof, self.filters = parts, parts.ndof, filters
+    def __init__(self, parts: ExactParts, scales: Scales, filters: bool) -> None:
+        self.parts, self.scales, self.ndof, self.filters = parts, scales, parts.ndof, filters
         self.lettered = [SymbolicLetters(part, [part.H]) for part in parts.rest]
+        self.codes: dict[tuple[tuple[int, ...], ...], PartsCode] = {}
         self._arranged: dict[int, Arranged] = {}
 
     def arranged(self, code: int) -> Arranged:
@@ -71,9 +103,11 @@ class PartMaps:
         d, letters = self.ndof, self.lettered[number - 1].letters
         filters = [f"phi_{j}" for j in range(d) if self.filters]
         states = [*((f"x_{j}", 0) for j in range(d)), *((f"y_{j}", EARLY) for j in range(d))]
-        made = Arrangement([*states, *((s.name, EARLY) for s in letters)], ["b", "g", *filters], expand)
-        (b, g, *phi), program = made.constants, self._slopes(number, bends)
-        slopes = program(*made.states, *(phi or [made.number(1.0)] * d))
+        constants = ["b", "g", *filters, *self.scales.named]
+        made = Arrangement([*states, *((s.name, EARLY) for s in letters)], constants, expand)
+        (b, g, *more), program = made.constants, self._slopes(number, bends)
+        phi, scales = more[: len(filters)], more[len(filters) :]
+        slopes = program(*made.states, *(phi or [made.number(1.0)] * d), *scales)
         changes = [times(b, v) for v in slopes[d : 2 * d]]
         changes += [times(g, w) - times(b, v) for v, w in zip(slopes[:d], slopes[2 * d :] or [0.0] * d, strict=True)]
         new = [made.written(x + made.number(change)) for x, change in zip(made.states, changes, strict=False)]
@@ -82,22 +116,28 @@ class PartMaps:
 
     def _slopes(self, number: int, bends: bool) -> Program:
         """∂H_k/∂x, ∂H_k/∂y and, where it is needed, ∂²H_k/∂x² M⁻¹∂H_k/∂x, from modes, letters and filters."""
-        parts, lettered, d = self.parts, self.lettered[number - 1], self.ndof
-        part, C, inverse = parts.rest[number - 1], parts.C.tolist(), parts.inverse_C.tolist()
+        lettered, scales, d = self.lettered[number - 1], self.scales, self.ndof
+        part, count = self.parts.rest[number - 1], len(lettered.letters)
 
         def slopes(*numbers: Any) -> list[Any]:
-            x, y, (letters, phi) = numbers[:d], numbers[d : 2 * d], (numbers[2 * d : -d], numbers[-d:])
+            x, y, letters, phi = (numbers[i:j] for i, j in pairwise((0, d, 2 * d, 2 * d + count, 3 * d + count)))
+            named = dict(zip(scales.named, numbers[3 * d + count :], strict=True))
             filtered = [f * v for f, v in zip(phi, x, strict=True)]
-            q = [summed(float(center), row, filtered) for center, row in zip(parts.center, C, strict=True)]
-            p = [summed(0.0, [row[i] for row in inverse], y) for i in range(d)]
-            known = evaluator(dict(zip((*part.q, *part.p, *lettered.letters), (*q, *p, *letters), strict=True)))
+            q, p = (
+                [s * summed(0.0, row, v) for s, row in zip(scales.row(name, named), A.tolist(), strict=True)]
+                for name, A, v in (("scale", scales.C, filtered), ("inverse", scales.inverse, y))
+            )
+            q = [center + v for center, v in zip(scales.row("center", named), q, strict=True)]
+            given = [named.get(s.name, scales.values[s.name]) for s in part.parameters]
+            symbols = *part.q, *part.p, *lettered.given
+            known = evaluator(dict(zip(symbols, (*q, *p, *given, *letters), strict=True)))
             slope = gradient(known(lettered.expressions[0]), [*x, *y])
-            rates = parts.inverse_masses(np.zeros(d)).tolist() if bends else []
+            rates = scales.row("rate", named) if bends else []
             along = tangent(slope[:d], x, [rate * v for rate, v in zip(rates, slope, strict=False)]) if bends else []
             return [*slope, *along]
 
         names = [f"{name}_{j}" for name in ("x", "y") for j in range(d)] + [s.name for s in lettered.letters]
-        return traced(slopes, *names, *(f"phi_{j}" for j in range(d)))
+        return traced(slopes, *names, *(f"phi_{j}" for j in range(d)), *scales.named)
 
     @cached_property
     def size(self) -> int:
@@ -111,8 +151,11 @@ class PartMaps:
         """Operations of a map."""
         return TURN_WIDTH * self.ndof if code == LINEAR else 0 if code == IDLE else len(self.arranged(code).body)
 
-    def entries(self, codes: np.ndarray, raw: np.ndarray) -> np.ndarray:
-        """The numbers (n, m, size) of maps, of given ones (n, m, ·): turns; or weights, gradients and filters."""
+    def entries(self, codes: np.ndarray, raw: np.ndarray, named: Sequence[float]) -> np.ndarray:
+        """The numbers (n, m, size) of maps, of given ones (n, m, ·): turns; or weights, gradients and filters.
+
+        The `named` numbers are those of `Scales`.
+        """
         entries = np.zeros((*raw.shape[:2], self.size))
         for code in np.unique(codes):
             here = codes == code
@@ -122,9 +165,9 @@ class PartMaps:
                 continue
             else:
                 table = self.arranged(int(code)).table
-                numbers = [raw[:, here, i] for i in range(len(table.inputs))]
+                numbers = [raw[:, here, i] for i in range(len(table.inputs) - len(named))]
                 with np.errstate(all="ignore"):
-                    outputs = [np.broadcast_to(x, numbers[0].shape) for x in table(*numbers)]
+                    outputs = [np.broadcast_to(x, numbers[0].shape) for x in table(*numbers, *named)]
                 rows = np.stack(outputs, axis=-1) if outputs else raw[:, here, :0]
             entries[:, here, : rows.shape[-1]] = rows
         return entries
@@ -235,7 +278,7 @@ class PartsLoops:
                 "`system` has parts that are not formulas, and exact flows of parts are compiled of formulas alone: "
                 "define it with from_sympy, or use backend='array'."
             )
-        rest = sum(written_out(part.H, (*part.q, *part.p)) for part in parts.rest)
+        rest = sum(_operations(part.H, (*part.q, *part.p)) for part in parts.rest)
         if parts.ndof > MOST_IN_REGISTERS or rest > MOST_WRITTEN_OUT:
             raise NotCompiled(
                 f"`system` is too large for compiled flows of its parts: {parts.ndof} degrees of freedom, about "
@@ -243,8 +286,8 @@ class PartsLoops:
                 " Use backend='array'."
             )
         self.parts, self.driven = parts, parts.driven
-        self._maps: dict[bool, PartMaps] = {False: PartMaps(parts, False)}
-        self._codes: dict[tuple[bool, tuple[tuple[int, ...], ...]], PartsCode] = {}
+        self._scales = Scales(parts)
+        self._of(())  # which says what has no compiled form
         self._tables: dict[int, tuple[Sequence[SubFlow], _Table]] = {}
 
     def kernel(self, maps: Maps) -> PartsKernel:
@@ -332,16 +375,17 @@ class PartsLoops:
         """The code of maps with what these have."""
         if any(m.has_gradient for m in sequence) and not self.parts.has_force_gradient:
             raise NotCompiled("`scheme` has force gradients, which need H = linear part + U(q): take one without them.")
-        filters = any(m.filters is not None for m in sequence)
-        if filters not in self._maps:
-            self._maps[filters] = PartMaps(self.parts, filters)
-        return self._maps[filters]
+        filters, parts, linear = any(m.filters is not None for m in sequence), self.parts, self.parts.linear
+        of_rest = tuple((part.H, part.q, part.p, part.time) for part in parts.rest)
+        of_linear = None if linear is None else (linear.kinds, linear.classes.tobytes())
+        key = PartMaps, filters, of_rest, of_linear, parts.has_force_gradient, self._scales.key
+        return shared(key, lambda: PartMaps(parts, self._scales, filters))
 
     def _code(self, maps: PartMaps, groups: Iterable[tuple[int, ...]]) -> PartsCode:
-        key = maps.filters, tuple(sorted({*groups}))
-        if key not in self._codes:
-            self._codes[key] = PartsCode(maps, key[1])
-        return self._codes[key]
+        key = tuple(sorted({*groups}))
+        if key not in maps.codes:
+            maps.codes[key] = PartsCode(maps, key)
+        return maps.codes[key]
 
     def _singles(self, maps: PartMaps) -> PartsCode:
         """The code of one map a column."""
@@ -366,7 +410,7 @@ class PartsLoops:
             raw[:, j, 0], raw[:, j, 1] = m.length, m.gradient
             if m.filters is not None:
                 raw[:, j, 2 : 2 + d] = self.parts.by_class(np.asarray(m.filters))
-        return codes, maps.entries(codes, raw)
+        return codes, maps.entries(codes, raw, [*self._scales.named.values()])
 
     def timed(self, sequence: Sequence[SubFlow], tables: np.ndarray, t: Any, h: Any) -> np.ndarray:
         """Tables (..., m, W) of steps h (...) that begin at t (...): a copy with the times, if the system is driven."""
@@ -469,6 +513,9 @@ class PartsKernel(Kernel):
         """One step from each row of `y` (N, 2d), each of its own length `h` (N,)."""
         lengths = np.broadcast_to(np.asarray(h, dtype=np.float64), y.shape[:1])
         return Steps(self.loops.stepped(self.maps(lengths), y, t, lengths))
+
+
+_operations = lru_cache(maxsize=64)(written_out)
 
 
 def _code_of(m: SubFlow) -> int:
