@@ -278,7 +278,7 @@ def read_off(form: Any, interval: float = 0.0) -> LinearPart | None:
     """The quadratic terms of a symbolic H, by the values of its parameters, or None if its potential has none."""
     import sympy as sp
 
-    quadratic, rest = quadratic_terms(form.H, (*form.q, *form.p))
+    quadratic, rest = quadratic_terms(form.H, (*form.q, *form.p), form.parameters)
     values = dict(zip(form.parameters, map(sp.Float, form.values), strict=True))
     return _read_off(quadratic.xreplace(values), rest, form.q, form.p, interval)
 
@@ -334,7 +334,9 @@ def _number(value: float) -> Any:
 
 
 @lru_cache(maxsize=64)
-def quadratic_terms(H: sp.Expr, variables: tuple[sp.Symbol, ...]) -> tuple[sp.Expr, sp.Expr]:
+def quadratic_terms(
+    H: sp.Expr, variables: tuple[sp.Symbol, ...], parameters: tuple[sp.Symbol, ...] = ()
+) -> tuple[sp.Expr, sp.Expr]:
     """H as polynomial terms of degree 2 or less and the rest; a term that has none of them is left as it is written.
 
     Mixed products q_i p_j stay in the rest.
@@ -346,8 +348,8 @@ def quadratic_terms(H: sp.Expr, variables: tuple[sp.Symbol, ...]) -> tuple[sp.Ex
     quadratic, rest = [], []
     for term in sp.Add.make_args(H):
         expanded = sp.Add.make_args(sp.expand(term))
-        low = [t for t in expanded if _degree(t, variables) <= 2 and not (t.has(*first) and t.has(*variables[half:]))]
-        if any(_degree(t, variables) == 2 for t in low) or len(low) == len(expanded):
+        low = [t for t in expanded if _degree(t, variables, parameters) <= 2 and not (t.has(*first) and t.has(*variables[half:]))]
+        if any(_degree(t, variables, parameters) == 2 for t in low) or len(low) == len(expanded):
             quadratic += low
             rest += [t for t in expanded if t not in low]
         else:
@@ -355,13 +357,13 @@ def quadratic_terms(H: sp.Expr, variables: tuple[sp.Symbol, ...]) -> tuple[sp.Ex
     return sp.Add(*quadratic), sp.Add(*rest)
 
 
-def _degree(term: sp.Expr, variables: tuple[sp.Symbol, ...]) -> float:
+def _degree(term: sp.Expr, variables: tuple[sp.Symbol, ...], parameters: tuple[sp.Symbol, ...]) -> float:
     """Total degree of a monomial in these; infinite for other expressions."""
     degree = 0
     for base, exponent in term.as_powers_dict().items():
         if base in variables and exponent.is_Integer and exponent > 0:
             degree += int(exponent)
-        elif not {*variables}.isdisjoint(base.free_symbols | exponent.free_symbols):
+        elif not (base.free_symbols | exponent.free_symbols) <= {*parameters}:
             return np.inf
     return degree
 

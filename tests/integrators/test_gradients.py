@@ -13,6 +13,7 @@ from sympflow.systems import driven_pendulum, henon_heiles
 CUBIC = HamiltonianSystem.from_sympy(
     "(p1**2/m + p2**2)/2 + k*(q1**2 + q2**2)/2 + g*(q1**2*q2 - q2**3/3)", params={"k": 1.0, "g": 0.9, "m": 1.2}
 )
+PARAMS = {"k": 1.1, "g": 0.9, "m": 1.2}
 DRIVEN = HamiltonianSystem.from_sympy(
     "p**2/2 - w*cos(q) + a*q*cos(b*t)", params={"w": 1.0, "a": 0.3, "b": 0.7}, time="t"
 )
@@ -544,3 +545,16 @@ def test_layers_whose_weights_are_fixed_are_compiled_whatever_their_width(fixed)
         torch.testing.assert_close(a, b, rtol=0, atol=1e-13)
     other = solve(system, "gauss_legendre4", (0, 0.5), y0.detach().numpy(), dt=0.1)  # by arrays
     np.testing.assert_allclose(other.y[:, -1], sol.y[:, -1].detach(), atol=0.01)
+
+
+@pytest.mark.parametrize("method", ["verlet", "rk4", "linear_aba864", "mollified_impulse", "tao4", "strang_parts"])
+def test_other_values_of_parameters_compile_nothing(method, monkeypatch):
+    system = HamiltonianSystem.from_sympy("(p1**2/m + p2**2 + k*q1**2 + q2**2)/2 + g*q1*q2**2", params=PARAMS)
+    solve(system, method, (0, 1), start(system, ()), dt=0.1)
+    monkeypatch.setattr("sympflow.kernels.runs.compiled", None)
+    for values in ({"g": 0.7}, {"k": 1.3, "m": 0.8}):
+        found, expected = (
+            solve(system, method, (0, 1), start(system, ()), dt=0.1, params=values, backend=backend)
+            for backend in ("compiled", "array")
+        )
+        np.testing.assert_allclose(found.y, expected.y, rtol=0, atol=1e-14)
