@@ -123,16 +123,16 @@ def _polynomials(x: np.ndarray, c: np.ndarray) -> Axis:
     return Axis(np.append(x[:-1][kept], x[-1]), np.moveaxis(c[::-1, kept], 0, -1)[:, None])
 
 
-def _basis(t: np.ndarray, k: int) -> Axis:
-    """B-splines of a degree between knots."""
+def _basis(t: np.ndarray, k: int, derivative: int) -> Axis:
+    """A derivative of B-splines of a degree between knots."""
     from scipy.interpolate import BSpline
 
     knots = t[k : len(t) - k]
-    if k <= SMOOTH or (np.diff(knots) <= 0).any():
+    if k - derivative <= SMOOTH or (np.diff(knots) <= 0).any():
         raise NotRecorded(JUMPS)
     every, i, j = BSpline(t, np.eye(len(t) - k - 1), k), np.arange(len(knots) - 1)[:, None], np.arange(k + 1)
     taylor = [every(knots[:-1], order)[i, i + j] / math.factorial(order) for order in range(k + 1)]
-    return Axis(knots, np.stack(taylor, axis=-1))
+    return Axis(knots, np.stack(taylor, axis=-1)).derived(derivative)
 
 
 def _check_real(c: np.ndarray, order: int) -> None:
@@ -154,9 +154,9 @@ def _of_polynomials(x: np.ndarray, c: np.ndarray, nu: int, extrapolate: Any) -> 
         raise NotRecorded("it has a PPoly with decreasing breakpoints: make it with increasing ones")
     found = np.empty(c.shape[2:], dtype=object)
     for index in np.ndindex(found.shape):
-        axis = _polynomials(x, c[(..., *index)])
+        axis = _polynomials(x, c[(..., *index)]).derived(nu)
         axis.check_smooth()
-        found[index] = Recorded([axis.derived(nu)], None, _beyond(extrapolate))
+        found[index] = Recorded([axis], None, _beyond(extrapolate))
     return found
 
 
@@ -193,8 +193,9 @@ def _called_bivariate(spline: Any, x: Any, y: Any, dx: int = 0, dy: int = 0, gri
     if grid:
         raise NotRecorded("it evaluates a spline on a grid: pass grid=False")
     tx, ty, c = spline.tck
+    _check_real(c, min(dx, dy))
     kx, ky = spline.degrees
-    axes = [_basis(tx, kx).derived(dx), _basis(ty, ky).derived(dy)]
+    axes = [_basis(tx, kx, dx), _basis(ty, ky, dy)]
     found = Recorded(axes, c.reshape(len(tx) - kx - 1, len(ty) - ky - 1), CLAMPED)
     return np.frompyfunc(found, 2, 1)(np.asarray(x, dtype=object), np.asarray(y, dtype=object))
 
@@ -211,7 +212,7 @@ def _called_tensor(spline: Any, xi: Any, *, nu: Any = None, extrapolate: Any = N
 def _of_product(spline: Any, xi: Any, nu: Any, beyond: Any) -> Any:
     orders = [0] * len(spline.t) if nu is None else list(nu)
     _check_real(spline.c, min(orders))
-    axes = [_basis(t, k).derived(n) for t, k, n in zip(spline.t, spline.k, orders, strict=True)]
+    axes = [_basis(*each) for each in zip(spline.t, spline.k, orders, strict=True)]
     found = np.empty(spline.c.shape[len(axes) :], dtype=object)
     for index in np.ndindex(found.shape):
         found[index] = Recorded(axes, np.ascontiguousarray(spline.c[(..., *index)]), beyond)

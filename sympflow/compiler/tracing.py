@@ -33,6 +33,7 @@ class Untraceable(TypeError):
 
 
 BRANCH = "it branches on a value: write np.where(condition, a, b) in place of `if`, `min` and `max`"
+OUT = "it calls {} with `out`, which holds no coordinates: take the result instead"
 VALUE = "it asks for the value of a coordinate, by float(), item() or a function of `math`: write np.cos for math.cos"
 WEIGHTS = "it has a tensor that requires gradients, such as weights of a network"
 BY_CONDITION = "it indexes by a condition: write np.where(condition, a, b)"
@@ -74,7 +75,7 @@ class TracedArray(np.ndarray):
     def __array_ufunc__(self, ufunc: Any, method: Any, *inputs: Any, out: Any = None, **kwargs: Any) -> Any:
         function, name, given = ufunc, ufunc.__name__, [_plain(x) for x in inputs]
         if out is not None and any(_plain(x) is x and method != "__call__" for x in out):
-            raise Untraceable(f"it calls {name} with `out`")
+            raise Untraceable(OUT.format(name))
         options = {key: _plain(x) for key, x in kwargs.items() if key != "dtype"}
         if name in NATIVE or function.types == ["O" * function.nin + "->O"]:
             called = function
@@ -93,6 +94,8 @@ class TracedArray(np.ndarray):
 
     def __array_function__(self, function: Any, types: Any, args: Any, options: Any) -> Any:
         name = function.__name__
+        if options.get("out") is not None:
+            raise Untraceable(OUT.format(name))
         if name in ARRAYS:
             return self._of(ARRAYS[name](*_plain(args), **_plain(options)))
         if name not in UNCHANGED:
@@ -109,6 +112,8 @@ class TracedArray(np.ndarray):
         raise Untraceable("numpy.sort has no rule")
 
     def _called(self, name: str, args: Any, options: Any) -> Any:
+        if options.get("out") is not None:
+            raise Untraceable(OUT.format(name))
         rule = ARRAYS.get(name) or getattr(np, name)
         return self._of(rule(_raw(self), *_plain(args), **_plain(options)))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -345,11 +345,11 @@ def quadratic_terms(
 
     half = len(variables) // 2
     first = set(variables[:half])
-    quadratic, rest = [], []
+    quadratic, rest, degree = [], [], partial(_degree, variables=variables, parameters=parameters)
     for term in sp.Add.make_args(H):
         expanded = sp.Add.make_args(sp.expand(term))
-        low = [t for t in expanded if _degree(t, variables, parameters) <= 2 and not (t.has(*first) and t.has(*variables[half:]))]
-        if any(_degree(t, variables, parameters) == 2 for t in low) or len(low) == len(expanded):
+        low = [t for t in expanded if degree(t) <= 2 and not (t.has(*first) and t.has(*variables[half:]))]
+        if any(degree(t) == 2 for t in low) or len(low) == len(expanded):
             quadratic += low
             rest += [t for t in expanded if t not in low]
         else:

@@ -45,7 +45,7 @@ POTENTIALS = {
     "components of a BSpline": (lambda q: (field(q[..., 0]) ** 2).sum(-1) + q[..., 0] ** 2, 1),
     "UnivariateSpline": (lambda q: smoothed(q[..., 0]), 1),
     "UnivariateSpline, held": (lambda q: held(q[..., 0]), 1),
-    "a derivative": (lambda q: cubic(q[..., 0], 1) ** 2, 1),
+    "a derivative": (lambda q: smoothed(q[..., 0], 2) ** 2, 1),
     "each of three": (lambda q: cubic(q).sum(-1), 3),
     "RectBivariateSpline": (lambda q: surface.ev(q[..., 0], q[..., 1]), 2),
     "its call": (lambda q: surface(q[..., 0], q[..., 1], grid=False), 2),
@@ -114,6 +114,8 @@ zero_beyond = UnivariateSpline(X, WELL, s=0, ext=1)
     [
         (lambda q: PPoly(np.ones((4, 2)), [1.0, 0.0, -1.0])(q[..., 0]), 1, "decreasing breakpoints: make it with"),
         (lambda q: kinked(q[..., 0]), 1, "second derivative jumps: take a smoother one, such as CubicSpline"),
+        (lambda q: cubic(q[..., 0], 1), 1, "second derivative jumps"),
+        (lambda q: surface.ev(q[..., 0], q[..., 1], dx=1), 2, "second derivative jumps"),
         (lambda q: linear((q[..., 0], q[..., 1])), 2, "with kinks: pass method='cubic'"),
         (bounded, 2, r"gives shape \(1,\) for one state: call it with coordinates"),
         (lambda q: surface(q[..., 0], q[..., 1]), 2, "pass grid=False"),

@@ -145,6 +145,7 @@ UNTRACEABLE = {
     "min": (lambda q: min(q[0], q[1]), "write np.where"),
     "asarray of floats": (lambda q: np.asarray(q, dtype=float).sum(-1), "float()"),
     "out": (lambda q: np.add.reduce(q, axis=-1, out=np.zeros(())), "with `out`"),
+    "out of a sum": (lambda q: np.sum(q**2, axis=-1, out=np.zeros(q.shape[:-1])), "with `out`"),
     "a shape": (lambda q: q**2, "returns an array of shape (4,)"),
 }
 # fmt: on
