@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from sympflow.arrays import Array, masked, to_numpy
 from sympflow.hamiltonian.scales import distance, weights
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.metrics.energy import failed
+from sympflow.metrics.energy import failed, of_groups
 from sympflow.metrics.reference import Reference
 from sympflow.metrics.reference import reference as compute_reference
 from sympflow.solution import Solution, check_solution, gathered
@@ -119,6 +119,7 @@ def states_of(reference: object) -> np.ndarray:
     return states
 
 
+@of_groups
 def time_reversal_error(sol: Solution) -> np.floating | np.ndarray:
     """‖y − y0‖₂, as in `reference_error`, after the run forwards to its end and the same method back from there, (...).
 
@@ -130,9 +131,6 @@ def time_reversal_error(sol: Solution) -> np.floating | np.ndarray:
     TypeError
         If `sol` is not a Solution, or its method cannot run backwards.
     """
-    check_solution(sol)
-    if sol.varied:
-        return gathered(sol, time_reversal_error)
     (t0, t1), y0 = sol.t_span, sol.y0
     there = _end(sol, (t0, t1), y0)
     finite = np.isfinite(to_numpy(there)).all(-1)

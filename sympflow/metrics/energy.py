@@ -2,15 +2,33 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import wraps
+from typing import Any, Concatenate, ParamSpec
 
 import numpy as np
 
 from sympflow.arrays import to_numpy
-from sympflow.solution import Solution, check_solution, energy_change
+from sympflow.solution import Solution, check_solution, energy_change, gathered
 
 MIN_BLOCKS = 20
 WINDOWS_PER_DECADE = 3
+
+P = ParamSpec("P")
+
+
+def of_groups(metric: Callable[Concatenate[Solution, P], Any]) -> Callable[Concatenate[Solution, P], Any]:
+    """Make a metric check its solution, and measure each group of trajectories that have the same parameters."""
+
+    @wraps(metric)
+    def measured(sol: Solution, *args: P.args, **options: P.kwargs) -> Any:
+        check_solution(sol)
+        if sol.varied:
+            return gathered(sol, lambda part: metric(part, *args, **options))
+        return metric(sol, *args, **options)
+
+    return measured
 
 
 def energy_error(sol: Solution, relative: bool = True) -> np.ndarray:

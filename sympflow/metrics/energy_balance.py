@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from sympflow.arrays import to_numpy
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.lazy import kept
-from sympflow.solution import Solution, check_solution, gathered
+from sympflow.metrics.energy import of_groups
+from sympflow.solution import Solution
 from sympflow.solver import solve
-
-if TYPE_CHECKING:
-    import sympy
 
 __all__ = ["energy_balance_error"]
 
@@ -21,6 +19,7 @@ NODES, WEIGHTS = np.polynomial.legendre.leggauss(6)
 """Gauss–Legendre quadrature of the integral over a step, where the method cannot run on the extended system."""
 
 
+@of_groups
 def energy_balance_error(sol: Solution, relative: bool = False) -> np.ndarray:
     """|H(t, x) − H(t0, x0) − ∫ ∂H/∂t dt| at the times `sol.t`: (..., n), in float64.
 
@@ -53,7 +52,6 @@ def energy_balance_error(sol: Solution, relative: bool = False) -> np.ndarray:
     ----------
     .. [1] E. Hairer, C. Lubich, G. Wanner, *Geometric Numerical Integration*, 2nd ed. (Springer 2006), VI.10 and IX.3.
     """
-    check_solution(sol)
     sol.system.check_conservative(
         "so that its energy is also lost to friction", "use sympflow.reference_error(sol), or solve it without damping"
     )
@@ -63,8 +61,6 @@ def energy_balance_error(sol: Solution, relative: bool = False) -> np.ndarray:
             f"`sol` is of {sol.system.name!r}, whose H jumps at some times, where ∂H/∂t is not finite: use "
             "sympflow.reference_error(sol), sympflow.symplecticity_defect(sol)."
         )
-    if sol.varied:
-        return gathered(sol, lambda part: energy_balance_error(part, relative))
     with np.errstate(all="ignore"):
         H, work = _balanced(sol)
         start = np.asarray(sol.system.hamiltonian(to_numpy(sol.y0).astype(float), sol.t_span[0]))
@@ -112,7 +108,7 @@ def extended_system(system: HamiltonianSystem) -> HamiltonianSystem | None:
     if symbols is None or symbols.samples or system.kinetic_timed:
         return None
     d, time = system.ndof, symbols.time
-    s = _symbol(f"q{d + 1}", time)
+    s = type(time)(f"q{d + 1}", real=True)
     H, values = symbols.written
     return HamiltonianSystem.from_sympy(
         H.xreplace({time: time + s}),
@@ -123,10 +119,6 @@ def extended_system(system: HamiltonianSystem) -> HamiltonianSystem | None:
         t_span=system.t_span,
         dt=system.dt,
     )
-
-
-def _symbol(name: str, like: sympy.Symbol) -> sympy.Symbol:
-    return type(like)(name, real=True)
 
 
 def _quadrature(sol: Solution) -> np.ndarray:

@@ -17,8 +17,8 @@ from sympflow.arguments import check_counts, warn
 from sympflow.arrays import jvp, to_numpy
 from sympflow.hamiltonian.scales import MOST_DENSE, natural_scale
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.metrics.energy import failed
-from sympflow.solution import Solution, check_solution, gathered
+from sympflow.metrics.energy import failed, of_groups
+from sympflow.solution import Solution, check_solution
 
 
 def step_tangents(sol: Solution) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
@@ -26,6 +26,7 @@ def step_tangents(sol: Solution) -> Iterator[tuple[np.ndarray, np.ndarray, np.nd
     return sol.integrator.executed(sol.system, sol.t_span, sol.y0)
 
 
+@of_groups
 def volume_error(sol: Solution, over_time: bool = False) -> np.floating | np.ndarray:
     """Σ log|det A_k| over the executed steps: the logarithm of the factor by which phase-space volume changed.
 
@@ -49,10 +50,7 @@ def volume_error(sol: Solution, over_time: bool = False) -> np.floating | np.nda
     TypeError
         If `sol` is not a Solution.
     """
-    check_solution(sol)
     _check_kept(sol, "volume")
-    if sol.varied:
-        return gathered(sol, lambda part: volume_error(part, over_time))
     batch, lost = sol.y.shape[:-2], failed(sol)
     total, series = np.zeros(batch), np.zeros((len(sol.t), *batch))
     direction = 1 if sol.t_span[1] >= sol.t_span[0] else -1
@@ -104,6 +102,7 @@ def _hold(series: np.ndarray, ends: np.ndarray, values: np.ndarray, t: np.ndarra
         np.copyto(series, value, where=(t + tolerance).reshape(-1, *[1] * end.ndim) >= end)
 
 
+@of_groups
 def symplecticity_defect(
     sol: Solution, relative: bool = False, scale: ArrayLike | None = None
 ) -> np.floating | np.ndarray:
@@ -132,12 +131,9 @@ def symplecticity_defect(
     ValueError
         If `scale` is not positive and finite, or has another shape.
     """
-    check_solution(sol)
     sol.system.check_conservative(
         "by which its flow is not symplectic", "use sympflow.conformal_defect(sol), which is 0 for the exact flow"
     )
-    if sol.varied:
-        return gathered(sol, lambda part: symplecticity_defect(part, relative, scale))
     if sol.system.local is not None and sol.system.ndof > MOST_DENSE and not relative and scale is None:
         return symplecticity_estimate(sol).value
     return _form_defect(sol, 0.0, relative, scale)
@@ -222,6 +218,7 @@ def _form(u: np.ndarray, v: np.ndarray) -> np.ndarray:
     return (u[..., :d] * v[..., d:] - u[..., d:] * v[..., :d]).sum(-1)
 
 
+@of_groups
 def conformal_defect(sol: Solution, relative: bool = False, scale: ArrayLike | None = None) -> np.floating | np.ndarray:
     """max over the executed steps of ‖AᵀJA − e^{−γh}J‖₂, (...), of a system with the friction −γp.
 
@@ -247,7 +244,6 @@ def conformal_defect(sol: Solution, relative: bool = False, scale: ArrayLike | N
     ----------
     .. [1] R. McLachlan, M. Perlmutter, "Conformal Hamiltonian systems", J. Geom. Phys. 39 (2001) 276–300.
     """
-    check_solution(sol)
     if sol.system.external_force is not None:
         sol.system.check_conservative("by which its flow is not conformally symplectic", "")
     friction = sol.system.friction
@@ -256,8 +252,6 @@ def conformal_defect(sol: Solution, relative: bool = False, scale: ArrayLike | N
             f"`sol` is of {sol.system.name!r}, whose momenta have different rates of friction: its flow is not "
             "conformally symplectic. Use sympflow.reference_error(sol)."
         )
-    if sol.varied:
-        return gathered(sol, lambda part: conformal_defect(part, relative, scale))
     return _form_defect(sol, friction.largest, relative, scale)
 
 
