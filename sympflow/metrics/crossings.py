@@ -5,6 +5,7 @@ Also the states after whole periods, the crossings of a driven system with the p
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -30,6 +31,20 @@ class Plane:
     def height(self, y: np.ndarray) -> np.ndarray:
         """y[..., coordinate] − level: (..., 2d) to (...)."""
         return y[..., self.coordinate] - self.level
+
+
+def bisected(
+    low: np.ndarray, high: np.ndarray, before: Callable[[np.ndarray], np.ndarray], halvings: int = 54
+) -> tuple[np.ndarray, np.ndarray]:
+    """The ends (n,) of intervals that are halved so often; `before` is True where a place is before the point sought.
+
+    By 54 halvings they are neighbours among floating-point numbers.
+    """
+    for _ in range(halvings):
+        middle = (low + high) / 2
+        kept = before(middle)
+        low, high = np.where(kept, middle, low), np.where(kept, high, middle)
+    return low, high
 
 
 class Crossings(NamedTuple):
@@ -187,10 +202,7 @@ class _Search:
         """Bisect all crossings together, in the fraction of the step."""
         y, t, h, sign = y[crossed], t[crossed], h[crossed], np.sign(before[crossed])
         low, high = np.full(len(y), a), np.where(sign == 0, a, b)
-        for _ in range(54):
-            middle = (low + high) / 2
-            g = self.plane.height(self._step(t, y, h * middle))
-            low, high = np.where(g * sign > 0, middle, low), np.where(g * sign > 0, high, middle)
+        _, high = bisected(low, high, lambda middle: self.plane.height(self._step(t, y, h * middle)) * sign > 0)
         self.found.append((np.nonzero(crossed)[1], t + h * high, self._step(t, y, h * high)))
 
     def _step(self, t: np.ndarray, y: np.ndarray, h: np.ndarray) -> np.ndarray:

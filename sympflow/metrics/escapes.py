@@ -17,6 +17,7 @@ from sympflow.integrators.diagnosis import try_steps
 from sympflow.integrators.grid import Grid
 from sympflow.integrators.impulses import landings, pieces_of
 from sympflow.integrators.registry import naming_plugin
+from sympflow.metrics.crossings import bisected
 from sympflow.metrics.orbits import OfOrbits, Orbits, checked_orbits, of_many
 from sympflow.systems.given import GivenSystem, given_system
 
@@ -218,9 +219,9 @@ def _located(
     integrator: FixedStep, system: HamiltonianSystem, times: Any, y: np.ndarray, h: float, region: Outside
 ) -> tuple[np.ndarray, np.ndarray]:
     """The parts (n,) of steps from y (n, 2d) at times (n,) after which states are outside, and these states."""
-    inside, out = np.zeros(len(y)), np.ones(len(y))
-    for _ in range(HALVINGS):
-        middle = (inside + out) / 2
-        kept = _inside(region, integrator.step(system, times, y, middle * h))
-        inside, out = np.where(kept, middle, inside), np.where(kept, out, middle)
+
+    def inside(part: np.ndarray) -> np.ndarray:
+        return _inside(region, np.asarray(integrator.step(system, times, y, part * h)))
+
+    _, out = bisected(np.zeros(len(y)), np.ones(len(y)), inside, HALVINGS)
     return out * h, np.asarray(integrator.step(system, times, y, out * h))

@@ -12,19 +12,19 @@ References
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.arguments import check_array, check_positive, checked_number, warn
+from sympflow.arguments import check_positive, checked_number, warn
 from sympflow.arrays import to_numpy
 from sympflow.hamiltonian.scales import weights
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.integrators.problems import check_y0
-from sympflow.integrators.registry import build, check_applies
+from sympflow.integrators.base import FixedStep
 from sympflow.metrics.crossings import dividing_step
+from sympflow.metrics.orbits import checked_orbits
 from sympflow.solver import solve
 from sympflow.systems.given import GivenSystem, given_system
 
@@ -124,15 +124,11 @@ def floquet_multipliers(
         raise ValueError(f"`period` is needed: the system {system.name!r} has none of its own.")
     check_positive("period", T)
     checked_number("t0", t0)
-    check_array(y0, "multipliers are of NumPy arrays")
-    start = check_y0(system, system.y0 if y0 is None else y0, None)
+    system, integrator, t_span, start = checked_orbits(system, method, (t0, t0 + T), y0, options, "multipliers are of")
     if start.ndim != 1:
         raise ValueError(f"`y0` must be one state, of shape ({2 * system.ndof},); got {start.shape}.")
-    integrator = build(method, options)
-    if "dt" in integrator.options() and integrator.step_length(system) == system.dt and "dt" not in options:
-        integrator = build(method, {**options, "dt": dividing_step(T, system.dt)})
-    integrator = integrator.resolved(system, start, float(T))
-    check_applies(integrator, system, start)
+    if isinstance(integrator, FixedStep) and integrator.dt is None and integrator.step_length(system) == system.dt:
+        integrator = replace(integrator, dt=dividing_step(T, system.dt))
     if not (integrator.on_grid or integrator.keeps):
         raise ValueError(
             f"`method` {integrator.name!r} chooses its steps by the error of the orbit, which says nothing of that of "
@@ -143,7 +139,6 @@ def floquet_multipliers(
             f"`method` {integrator.name!r} keeps {integrator.keeps}, so that its Jacobians are not those of states: "
             "use a splitting method such as 'kahan_li8', or an implicit one such as 'gauss_legendre6'."
         )
-    t_span = (float(t0), float(t0 + T))
     end = solve(system, integrator, t_span, start, t_eval=[t_span[1]]).raise_for_status().y[:, -1]
     mismatch = float(np.linalg.norm(to_numpy(end) - start))
     scale = weights(system)

@@ -32,6 +32,7 @@ from sympflow.hamiltonian.scales import weights
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.contract import Integrator
 from sympflow.integrators.registry import build
+from sympflow.metrics.crossings import bisected
 from sympflow.schemes import POLYNOMIAL, Scheme
 
 DIGITS = 100  # of the arithmetic in which roots are found
@@ -403,13 +404,9 @@ def _found(growth: np.ndarray, steps: np.ndarray, at: Callable[[np.ndarray], np.
     """The windows in a list of steps, their ends by bisection."""
     bad, grid = np.concatenate([[False], growth > 1 + GROWS]), np.concatenate([[0.0], steps])
     edges = np.flatnonzero(bad[1:] != bad[:-1])
-    low, high = grid[edges], grid[edges + 1]
-    for _ in range(30):
-        if not len(edges):
-            return []
-        middle = (low + high) / 2
-        same = (at(middle) > 1 + GROWS) == bad[edges]
-        low, high = np.where(same, middle, low), np.where(same, high, middle)
+    if not len(edges):
+        return []
+    low, high = bisected(grid[edges], grid[edges + 1], lambda h: (at(h) > 1 + GROWS) == bad[edges], 30)
     ends = [*((low + high) / 2).tolist(), math.inf]
     windows = []
     for i in range(0, len(edges), 2):

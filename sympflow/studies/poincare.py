@@ -17,7 +17,7 @@ from sympflow.hamiltonian.scales import weights
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import Integrator
 from sympflow.integrators.registry import name_of
-from sympflow.metrics.crossings import Crossings, Plane, crossings, stroboscopic, whole_periods
+from sympflow.metrics.crossings import Crossings, Plane, bisected, crossings, stroboscopic, whole_periods
 from sympflow.metrics.orbits import Orbits, checked_orbits
 from sympflow.show.style import saved
 from sympflow.studies.reports import Column, Report, described, text_table
@@ -166,10 +166,7 @@ def states_of_energy(system: HamiltonianSystem, energy: float, n: int, plane: Pl
         over = H(starts + steps[:, None, None] * rays) > energy
         first = over.argmax(0)
         low, high = np.where(first > 0, steps[np.maximum(first - 1, 0)], 0.0), steps[first]
-        for _ in range(60):
-            middle = (low + high) / 2
-            beyond = H(starts + middle[:, None] * rays) > energy
-            low, high = np.where(beyond, low, middle), np.where(beyond, middle, high)
+        low, _ = bisected(low, high, lambda middle: ~(H(starts + middle[:, None] * rays) > energy), 60)
         return np.where(over.any(0), low, np.nan)
 
     known = [np.zeros(2 * d)] if system.y0 is None else [np.zeros(2 * d), system.y0]
