@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -37,7 +37,8 @@ from sympflow.studies.attempts import (
     interleaved,
     tolerance_of,
 )
-from sympflow.studies.reports import Column, Report, described, seconds, text_table
+from sympflow.studies.figures import Compared, comparison_figure, save_comparison
+from sympflow.studies.reports import Column, described, seconds, text_table
 from sympflow.systems.given import GivenSystem, given_system
 
 if TYPE_CHECKING:
@@ -158,7 +159,7 @@ def compare(
         if one.sol is not None:
             say(f"{system.name}: measuring {one.candidate.label}")
             one.measure([metric for metric in asked if metric in MEASURES])
-    return Comparison(system, (t0, t1), start, t, asked, repeats, match, truth, tuple(runs))
+    return Comparison(system, (t0, t1), start, t, asked, tuple(runs), repeats, match, truth)
 
 
 def default_metrics(system: HamiltonianSystem) -> tuple[str, ...]:
@@ -357,7 +358,7 @@ def matched(
 
 
 @dataclass(frozen=True, repr=False)
-class Comparison(Report):
+class Comparison(Compared):
     """Methods side by side on one system.
 
     Attributes
@@ -381,24 +382,13 @@ class Comparison(Report):
         *("compile_time", "force_evaluations", "hessian_evaluations", "error", *OF_MEASURES, "training_time"),
     )
 
-    system: HamiltonianSystem
-    t_span: tuple[float, float]
-    y0: np.ndarray = field(repr=False)
-    t: np.ndarray = field(repr=False)
-    metrics: tuple[str, ...]
     repeats: int
     match: str | None
     reference: Reference | None
-    runs: tuple[Attempt, ...] = field(repr=False)
 
     @property
     def rows(self) -> tuple[Row, ...]:
         return tuple(run.row for run in self.runs)
-
-    @property
-    def title(self) -> str:
-        """The scene in a line."""
-        return self.system.title
 
     def table(self, width: int | None = None) -> str:
         """The rows as text, with the settings above and the reasons below.
@@ -420,8 +410,6 @@ class Comparison(Report):
 
     def figure(self, kind: str = "overview") -> Figure:
         """A matplotlib figure: "overview", "energy", "volume", "error" (against run time) or "portrait"."""
-        from sympflow.studies.figures import comparison_figure
-
         return comparison_figure(self, kind)
 
     def plot(self, path: str | os.PathLike[str] | None = None, kind: str = "overview", prefix: str = "") -> Figure:
@@ -436,8 +424,6 @@ class Comparison(Report):
         prefix : str
             Beginning of the names of the files in a folder; the kinds follow.
         """
-        from sympflow.studies.figures import save_comparison
-
         figure = self.figure(kind)
         if path is not None:
             save_comparison(self, path, kind, prefix)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from sympflow.show.style import TEXT, dress, filled, frame, labelled, legend_abo
 from sympflow.solution import Solution
 from sympflow.solver import solve
 from sympflow.studies.attempts import Attempt, Row, any_step
+from sympflow.studies.reports import Report
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -41,23 +43,21 @@ UNSTABLE = "#5A1020"
 _GREEK = {"omega": "ω"}
 
 
-class Compared(Protocol):
+@dataclass(frozen=True, repr=False)
+class Compared(Report):
     """The part of a comparison that is drawn."""
 
+    system: HamiltonianSystem
+    t_span: tuple[float, float]
+    y0: np.ndarray = field(repr=False)
+    t: np.ndarray = field(repr=False)
+    metrics: tuple[str, ...]
+    runs: tuple[Attempt, ...] = field(repr=False)
+
     @property
-    def system(self) -> HamiltonianSystem: ...
-    @property
-    def title(self) -> str: ...
-    @property
-    def t_span(self) -> tuple[float, float]: ...
-    @property
-    def y0(self) -> np.ndarray: ...
-    @property
-    def t(self) -> np.ndarray: ...
-    @property
-    def metrics(self) -> tuple[str, ...]: ...
-    @property
-    def runs(self) -> tuple[Attempt, ...]: ...
+    def title(self) -> str:
+        """The scene in a line."""
+        return self.system.title
 
 
 # comparisons ----------------------------------------------------------------------------------------------------------

@@ -208,9 +208,11 @@ def _measure(
     for candidate, integrators in swept:
         say(f"{scene}: {candidate.label}")
         error = math.inf
-        compile_time = _compiled(replace(candidate, integrator=integrators[-1]), conditions)
+        row = Row(conditions.system.name, candidate.method, candidate.label, trajectories=conditions.trajectories)
+        warm = Attempt(replace(candidate, integrator=integrators[-1]), row)
+        warm.warm_up(conditions.run, conditions.t, conditions.t_span[0], conditions.system.dt)
         for integrator in integrators:
-            point = _first(replace(candidate, integrator=integrator), conditions, compile_time)
+            point = _first(Attempt(replace(candidate, integrator=integrator), warm.row), conditions)
             points.append(point)
             if truth is None:
                 point.note(f"No error: {problem}")
@@ -241,13 +243,6 @@ def _reference(conditions: Conditions) -> tuple[Reference | None, str]:
         return None, str(problem)
 
 
-def _compiled(candidate: Candidate, conditions: Conditions) -> float | None:
-    """Compile all that the points of a method run; the seconds that it took, None if it does not run."""
-    point = Attempt(candidate, Row(conditions.system.name, candidate.method, candidate.label))
-    point.warm_up(conditions.run, conditions.t, conditions.t_span[0], conditions.system.dt)
-    return point.row.compile_time
-
-
 def _scale(point: Attempt, few: int, all_of_them: int) -> None:
     """Scale the run time of a few trajectories to all of them."""
     times = {"run_time": point.row.run_time, "run_time_spread": point.row.run_time_spread}
@@ -255,10 +250,8 @@ def _scale(point: Attempt, few: int, all_of_them: int) -> None:
     point.note(f"Timed on {few} trajectories, which the method takes one by one.")
 
 
-def _first(candidate: Candidate, conditions: Conditions, compile_time: float | None) -> Attempt:
-    """The first run of a point."""
-    row = Row(conditions.system.name, candidate.method, candidate.label, trajectories=conditions.trajectories)
-    point = Attempt(candidate, replace(row, compile_time=compile_time))
+def _first(point: Attempt, conditions: Conditions) -> Attempt:
+    """The point after its first run."""
     point.run(conditions.run)
     if (sol := point.sol) is None:
         return point
