@@ -36,10 +36,10 @@ def driven_pendulum(amplitude: float = 0.3, frequency: float = 2.7) -> Hamiltoni
     ----------
     .. [1] L. D. Landau, E. M. Lifshitz, "Mechanics", 3rd ed., Pergamon 1976, § 27 and § 30.
     """
-    period = 2 * math.pi / _positive("frequency", frequency)
+    period = 2 * math.pi / positive("frequency", frequency)
     return HamiltonianSystem.from_sympy(
         "p**2/2 - (1 + a*cos(w*t))*cos(q)",
-        params={"a": _positive("amplitude", amplitude), "w": frequency},
+        params={"a": positive("amplitude", amplitude), "w": frequency},
         time="t",
         period=period,
         name="driven_pendulum",
@@ -114,12 +114,12 @@ def duffing(
     .. [1] J. Guckenheimer, P. Holmes, "Nonlinear Oscillations, Dynamical Systems, and Bifurcations of Vector Fields",
        Springer 1983, 2.2.
     """
-    period = 2 * math.pi / _positive("frequency", frequency)
+    period = 2 * math.pi / positive("frequency", frequency)
     return HamiltonianSystem.from_sympy(
         "p**2/2 + alpha*q**2/2 + beta*q**4/4 - F*q*cos(w*t)",
         params={
             "alpha": checked_number("alpha", alpha),
-            "beta": _positive("beta", beta),
+            "beta": positive("beta", beta),
             "F": _not_zero("force", force),
             "w": frequency,
         },
@@ -180,7 +180,7 @@ def fodo_cell(strength: float = 0.8, quadrupole: float = 0.5, drift: float = 2.0
     lattice = PPoly(np.array([[1.0, 0.0, -1.0, 0.0, 1.0]]), ends, extrapolate="periodic")
     return HamiltonianSystem.from_sympy(
         "(p1**2 + p2**2)/2 + k*lattice*(q1**2 - q2**2)/2",
-        params={"k": _positive("strength", strength), "lattice": lattice},
+        params={"k": positive("strength", strength), "lattice": lattice},
         time="t",
         period=float(cell),
         name="fodo_cell",
@@ -208,7 +208,7 @@ def fodo_matrices(strength: float = 0.8, quadrupole: float = 0.5, drift: float =
     ----------
     .. [1] E. D. Courant, H. S. Snyder, "Theory of the alternating-gradient synchrotron", Ann. Phys. 3 (1958) 1–48.
     """
-    wave = math.sqrt(_positive("strength", strength))
+    wave = math.sqrt(positive("strength", strength))
     half, between = float(_exact("quadrupole", quadrupole)) / 2, float(_exact("drift", drift))
 
     def lens(sign: int, length: float) -> np.ndarray:
@@ -279,10 +279,11 @@ def _not_zero(name: str, value: float) -> float:
     return value
 
 
-def _positive(name: str, value: float) -> float:
-    return check_positive(name, value, most=1e100)
+def positive(name: str, value: float) -> float:
+    """The value, if it is a positive number whose square is one too."""
+    return float(check_positive(name, value, most=1e100))
 
 
 def _exact(name: str, length: float) -> Fraction:
     """A length as the fraction that was written, such as 1/10 for 0.1."""
-    return Fraction(repr(float(_positive(name, length))))
+    return Fraction(repr(float(positive(name, length))))

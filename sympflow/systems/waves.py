@@ -13,9 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from sympflow.arguments import check_one_of, check_positive, checked_count, checked_number
+from sympflow.arguments import check_one_of, checked_count, checked_number
 from sympflow.hamiltonian.domain import Box
 from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.systems.driven import positive
 
 STENCILS: dict[int, dict[int, str]] = {
     2: {1: "r**2/(2*h**2)"},
@@ -69,7 +70,7 @@ def wave_equation(n: int = 256, speed: float = 1.0, width: float = 0.5, accuracy
     interval is one turn around the ring, the default step h/(2c).
     """
     n, h = _sites(n, accuracy), 2 * math.pi / _sites(n, accuracy)
-    c, w = _positive("speed", speed), _positive("width", width)
+    c, w = positive("speed", speed), positive("width", width)
     high = np.repeat([1.2, 1.2 * c / w], n)
     return _system(
         "wave_equation",
@@ -129,7 +130,7 @@ def sine_gordon(
     .. [1] P. G. Drazin, R. S. Johnson, "Solitons: an Introduction", Cambridge 1989, 3.3 and 4.5.
     """
     n = _sites(n, accuracy)
-    h, v = _positive("length", length) / n, _velocity(velocity)
+    h, v = positive("length", length) / n, _velocity(velocity)
     check_one_of("wave", wave, ("breather", "kink"))
     if wave == "breather":
         checked_number("frequency", frequency, "between 0 and 1, of a breather", lambda w: 0 < w < 1)
@@ -202,7 +203,7 @@ def phi4(velocity: float = 0.3, n: int = 512, length: float = 80.0, accuracy: in
     .. [1] R. Rajaraman, "Solitons and Instantons", North-Holland 1982, 2.3.
     """
     n = _sites(n, accuracy)
-    h, v = _positive("length", length) / n, _velocity(velocity)
+    h, v = positive("length", length) / n, _velocity(velocity)
     high = np.repeat([1.5, 1.5 * _gamma(v)], n)
     return _system(
         "phi4",
@@ -256,8 +257,8 @@ def nonlinear_schroedinger(
     .. [1] V. E. Zakharov, A. B. Shabat, "Exact theory of two-dimensional self-focusing and one-dimensional
        self-modulation of waves in nonlinear media", Sov. Phys. JETP 34 (1972) 62–69.
     """
-    n, L = _sites(n, 2), _positive("length", length)
-    eta, v = _positive("amplitude", amplitude), float(checked_number("velocity", velocity))
+    n, L = _sites(n, 2), positive("length", length)
+    eta, v = positive("amplitude", amplitude), float(checked_number("velocity", velocity))
     x, high = _grid(n, L / n), np.full(2 * n, 1.6 * eta)
     exact = partial(_states, partial(_soliton, amplitude=eta, velocity=v, start=_start(v, L / 2), length=L), x)
     return HamiltonianSystem.schroedinger(
@@ -310,7 +311,7 @@ def toda_chain(n: int = 128, kappa: float = 0.5) -> HamiltonianSystem:
     ----------
     .. [1] M. Toda, "Theory of Nonlinear Lattices", 2nd ed., Springer 1989, 2.2 and 3.4.
     """
-    n, k = _sites(n, 2), _positive("kappa", kappa)
+    n, k = _sites(n, 2), positive("kappa", kappa)
     checked_number("kappa", k, "at most 20, for the soliton is otherwise less than a site wide", lambda x: x <= 20)
     speed = math.sinh(k) / k
     high = np.repeat([1.5 * k, 3 * k * speed * math.sinh(k) + 1e-3], n)
@@ -364,7 +365,7 @@ def fput_beta(n: int = 64, beta: float = 1.0, amplitude: float = 0.1) -> Hamilto
     n = _sites(n, 2)
     if n % 2:
         raise ValueError(f"`n` must be even, for neighbours on the ring move against each other; got {n}.")
-    b, A = _positive("beta", beta), _positive("amplitude", amplitude)
+    b, A = positive("beta", beta), positive("amplitude", amplitude)
     w = math.sqrt(4 + 16 * b * A * A)
     period = 4 * float(ellipk(8 * b * A * A / w**2)) / w
     high = np.repeat([2 * A, 2 * A * w], n)
@@ -419,10 +420,6 @@ def _start(velocity: float, length: float) -> float:
 def _crossing(velocity: float, length: float) -> float:
     """The time in which a wave crosses half the length, at most 200."""
     return min(200.0, length / 2 / abs(velocity)) if velocity else 50.0
-
-
-def _positive(name: str, value: float) -> float:
-    return float(check_positive(name, value, most=1e100))
 
 
 def _velocity(value: float) -> float:
