@@ -529,9 +529,9 @@ class _Search:
 
     def _parts(self) -> list[list[int]]:
         """Parts of the library: powers, waves and others in turn, with any kinetic energy and with ½ pᵀM⁻¹p."""
-        terms, d = self.library.expressions, self.data.ndof
+        terms = self.library.expressions
         degree = np.array([sp.Poly(f).total_degree() if f.is_polynomial() else 0 for f in terms])
-        kind = np.array([term.kind(d) for term in self.library.terms])
+        kind = np.array(self.library.kinds)
         power, wave = degree > 0, np.array([f.has(sp.cos, sp.sin) for f in terms])
         square = power & (degree <= 2)
         shapes = np.stack([power | True, power, ~wave, square | ~(power | wave), square | wave, square])
@@ -752,7 +752,7 @@ class _Search:
         d = self.data.ndof
         states = np.concatenate(fit.orbits, axis=1).T
         errors = fit.noise() * math.sqrt(fit.states.size / fit.counts.sum())
-        separable = all(self.library.terms[k].kind(d) != "y" for k in chosen)
+        separable = all(self.library.kinds[k] != "y" for k in chosen)
         groups = [range(d), range(d, 2 * d)] if separable else [range(2 * d)]
         found = tuple(g for columns in groups for g in unseen(states, errors, columns))
         if found:

@@ -76,75 +76,42 @@ def distances(ndof: int) -> list[sp.Expr]:
 LIBRARIES = {"polynomials": polynomials, "trigonometric": trigonometric, "distances": distances}
 
 
-class _Term:
-    """A term with its derivatives, as functions of the columns of the coordinates that it depends on."""
-
-    def __init__(self, expression: sp.Expr, symbols: Sequence[sp.Symbol]) -> None:
-        self.expression = expression
-        self.rows = [i for i, x in enumerate(symbols) if x in expression.free_symbols]
-        self.symbols = [symbols[i] for i in self.rows]
-        self._slopes = [sp.diff(expression, x) for x in self.symbols]
-
-    def kind(self, ndof: int) -> str:
-        """The coordinates that it depends on: "q", "p" or "y" for both."""
-        return "q" if max(self.rows, default=0) < ndof else "p" if min(self.rows) >= ndof else "y"
-
-    @cached_property
-    def quadratic(self) -> bool:
-        return self.expression.is_polynomial() and sp.Poly(self.expression, *self.symbols).homogeneous_order() == 2
-
-    @cached_property
-    def value(self) -> Any:
-        return generate([self.expression], self.symbols, "numpy")
-
-    @cached_property
-    def gradient(self) -> Any:
-        return generate(self._slopes, self.symbols, "numpy")
-
-
 class Library:
     """Terms f_k of a Hamiltonian, expressions in the symbols q1 … qd, p1 … pd."""
 
     def __init__(self, expressions: Sequence[sp.Expr], ndof: int) -> None:
-        self.ndof = ndof
-        q, p = coordinates(ndof)
-        self.expressions = tuple(expressions)
-        self.terms = [_Term(f, (*q, *p)) for f in expressions]
+        self.ndof, self.expressions = ndof, tuple(expressions)
 
     def __len__(self) -> int:
         return len(self.expressions)
 
     def subset(self, index: Sequence[int]) -> Library:
         """The library of some of the terms."""
-        chosen = Library.__new__(Library)
-        chosen.ndof, chosen.terms = self.ndof, [self.terms[k] for k in index]
-        chosen.expressions = tuple(self.expressions[k] for k in index)
-        return chosen
+        return Library([self.expressions[k] for k in index], self.ndof)
+
+    @cached_property
+    def kinds(self) -> list[str]:
+        """The coordinates that each term depends on: "q", "p" or "y" for both."""
+        q, p = map(set, coordinates(self.ndof))
+        used = [f.free_symbols for f in self.expressions]
+        return ["q" if symbols <= q else "p" if symbols <= p else "y" for symbols in used]
 
     def by_kind(self) -> Library:
         """The same terms, those of q alone first, then those of p alone: in the order of a `model`."""
-        return self.subset(sorted(range(len(self)), key=lambda k: KINDS.index(self.terms[k].kind(self.ndof))))
+        return self.subset(sorted(range(len(self)), key=lambda k: KINDS.index(self.kinds[k])))
 
     def model(self) -> Model:
         """The sum of these terms as an H to be fitted, of terms `by_kind`."""
-        kinds = [term.kind(self.ndof) for term in self.terms]
-        chosen = {of: [k for k, kind in enumerate(kinds) if kind == of] for of in KINDS}
+        chosen = {of: [k for k, kind in enumerate(self.kinds) if kind == of] for of in KINDS}
         return Model(self.ndof, tuple(Terms(self.subset(index), of) for of, index in chosen.items() if index))
 
     def values(self, x: np.ndarray) -> np.ndarray:
         """f_k at x (n, 2d): (n, K)."""
-        made = np.empty((len(x), len(self)))
-        for k, term in enumerate(self.terms):
-            made[:, k] = term.value(*x.T[term.rows])[0]
-        return made
+        return Terms(self, "y").functions(x.T).T
 
     def gradients(self, x: np.ndarray) -> np.ndarray:
         """∇f_k at x (n, 2d): (n, 2d, K)."""
-        made = np.zeros((*x.shape, len(self)))
-        for k, term in enumerate(self.terms):
-            for i, entry in zip(term.rows, term.gradient(*x.T[term.rows]), strict=True):
-                made[:, i, k] = entry
-        return made
+        return Terms(self, "y").derivatives(x.T)[0].transpose(2, 0, 1)
 
     def fields(self, x: np.ndarray) -> np.ndarray:
         """J∇f_k at x (n, 2d): (n, 2d, K)."""
@@ -164,7 +131,8 @@ class Terms(Sum):
 
     @cached_property
     def quadratic(self) -> bool:  # type: ignore[override]
-        return all(term.quadratic for term in self.library.terms)
+        terms = self.library.expressions
+        return all(f.is_polynomial() and sp.Poly(f, *f.free_symbols).homogeneous_order() == 2 for f in terms)
 
     @property
     def width(self) -> int:

@@ -6,12 +6,13 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache, partial
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 
+from sympflow.hamiltonian.collocation import gauss_legendre
 from sympflow.learning.models import FreeField, Model, VectorField
 from sympflow.learning.parts import Linear
 from sympflow.learning.reading import Run
@@ -114,7 +115,9 @@ class Gauss(Stepper):
 
     @cached_property
     def _table(self) -> tuple[Array, Array]:
-        return _gauss_table(self.stages)
+        """A and b."""
+        rows, weights, scale = map(np.array, gauss_legendre(self.stages))
+        return rows * scale, weights * scale
 
     def within(self, tolerance: Array) -> Gauss:
         return replace(self, tolerance=SOLVED * tolerance)
@@ -152,16 +155,6 @@ class Gauss(Stepper):
             return end * np.nan, X
         slopes = np.linalg.solve(matrix, rhs.reshape(N, s * m, c)).reshape(N, s, m, c)
         return end, X + h * np.einsum("j,njkc->kcn", b, slopes)
-
-
-@lru_cache
-def _gauss_table(s: int) -> tuple[Array, Array]:
-    """A and b of Gauss's collocation with s stages."""
-    nodes, weights = np.polynomial.legendre.leggauss(s)
-    c, b = (nodes + 1) / 2, weights / 2
-    powers = np.vander(c, s, increasing=True)
-    integrals = powers * c[:, None] / np.arange(1, s + 1)
-    return integrals @ np.linalg.inv(powers), b
 
 
 SPLITTINGS = ("blanes_moan4", "srkn11b", "kahan_li8")

@@ -150,6 +150,17 @@ def without_growth(found: Fitted, settled: bool = True) -> Fitted:
     return replace(found, theta=found.fit.without(growing, theta))
 
 
+def _made(make: Callable[[float | None], FlowMap], dt: float | None) -> FlowMap:
+    """A flow of this Δt, or of its own where that is not given, or none can be made of it."""
+    try:
+        return make(dt)
+    except ValueError as error:
+        if dt is None:
+            raise
+        warn(f"{error} The flow that was made has its own.")
+    return make(None)
+
+
 Chosen = tuple[Candidate, Fitted, Held]
 
 
@@ -655,13 +666,7 @@ class Search:
             options["time_budget"] = min(options.get("time_budget", math.inf), DOUBTFUL_SECONDS)
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message="Training", category=RuntimeWarning)
-            try:
-                return train(system, dt, progress=session.progress, seed=self.seed, **options)
-            except ValueError as error:
-                if dt is None:
-                    raise
-                warn(f"{error} The flow that was made has its own.")
-            return train(system, None, progress=session.progress, seed=self.seed, **options)
+            return _made(lambda own: train(system, own, progress=session.progress, seed=self.seed, **options), dt)
 
     def _collocated(self, system: HamiltonianSystem, dt: float | None) -> FlowMap:
         """Steps of a Gauss method, as many as they take where the data are: no fit comes near their accuracy."""
@@ -671,13 +676,8 @@ class Search:
         rates = np.abs(np.linalg.eigvals(np.moveaxis(np.broadcast_to(slopes, (*slopes.shape[:2], len(states))), -1, 0)))
         step = min(step_of(rates.max(axis=1)), max(run.span for run in self.data.runs))
         if isinstance(system, DoubledSystem):
-            return SympFlow.collocated(system, dt=step if dt is None else dt, steps=DRAG_STEPS)
-        if dt is not None:
-            try:
-                return SympFlow.collocated(system, dt=dt, states=states)
-            except ValueError as error:
-                warn(f"{error} The flow that was made has its own.")
-        return SympFlow.collocated(system, dt=step, states=states)
+            return SympFlow.collocated(system, dt=dt or step, steps=DRAG_STEPS)
+        return _made(lambda own: SympFlow.collocated(system, dt=own or step, states=states), dt)
 
     def _is_worse(self, flow: FlowMap) -> bool:
         """True of a flow that is worse than the H it was made of."""

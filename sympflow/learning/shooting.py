@@ -464,18 +464,18 @@ def matched(
     return theta
 
 
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")
 def increments_left(model: Field, theta: np.ndarray, data: Trajectories, weights: np.ndarray) -> float:
     """The squares of y(t) − ∫ f_θ(y) dt less a constant for each piece, weighted (2d,): 0 of the field of the data."""
     pieces = [run for run in map(_whole, data.runs) if run.n_points > 1]
-    if model.velocities:
-        y = np.concatenate([run.y for run in pieces], axis=1)
-        x, here = model.states(theta, y), model.at(np.concatenate([run.t for run in pieces]))
-        rates = model.observed(theta, x, here.field(theta, x, False, False).value[:, None])[1][:, 0]
-        parts = np.split(rates, np.cumsum([run.n_points for run in pieces])[:-1], axis=1)
-        rests = [run.y - integrals(run.t, part) for run, part in zip(pieces, parts, strict=True)]
-        return float(sum((((rest.T - rest.mean(axis=1)) * weights) ** 2).sum() for rest in rests))
-    r, _ = _increments(model, theta, pieces, weights) if pieces else (np.zeros(0), None)
-    return float(r @ r)
+    if not pieces:
+        return 0.0
+    x = model.states(theta, np.concatenate([run.y for run in pieces], axis=1))
+    here = model.at(np.concatenate([run.t for run in pieces]))
+    rates = model.observed(theta, x, here.field(theta, x, False, False).value[:, None])[1][:, 0]
+    parts = np.split(rates, np.cumsum([run.n_points for run in pieces])[:-1], axis=1)
+    rests = [run.y - integrals(run.t, part) for run, part in zip(pieces, parts, strict=True)]
+    return float(sum((((rest.T - rest.mean(axis=1)) * weights) ** 2).sum() for rest in rests))
 
 
 def _whole(run: Run) -> Run:
