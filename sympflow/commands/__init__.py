@@ -10,14 +10,18 @@ from typer.core import TyperCommand
 
 from sympflow._version import __version__
 from sympflow.commands import learning, listings, running, studying
-from sympflow.commands.console import out
+from sympflow.commands.console import out, reporting
 
 PARAMETERS = {"allow_extra_args": True, "ignore_unknown_options": True}
 """Options that are unknown to a command may be parameters of a system: --omega 100."""
 
 
 class Command(TyperCommand):
-    """A command that refuses an option given twice, instead of taking the last value."""
+    """A command that reports its errors, and refuses an option given twice, instead of taking the last value."""
+
+    def invoke(self, ctx: Any) -> Any:
+        with reporting(ctx):
+            return super().invoke(ctx)
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         order: list[Any] = self.make_parser(ctx).parse_args(args=[*args])[2]

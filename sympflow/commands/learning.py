@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from typer import Option
 
-from sympflow.commands.console import Quiet, asked, out, print_table, ready_file, reporting, show
+from sympflow.commands.console import Quiet, asked, out, print_table, ready_file, show
 from sympflow.commands.words import File, Number, Text, Usage, numbers, one_scene, parsed
 
 if TYPE_CHECKING:
@@ -68,43 +68,42 @@ def learn(
 
       sympflow learn orbits.csv --mass 1,2.5 --known own.toml --family polynomial
     """
-    with reporting(ctx):
-        from sympflow.learning.learner import learn as learn_flow
-        from sympflow.learning.trajectories import Trajectories
+    from sympflow.learning.learner import learn as learn_flow
+    from sympflow.learning.trajectories import Trajectories
 
-        if damping and drag:
-            raise ValueError("`--drag` is learned in place of `--damping`: leave out one of them.")
-        ready_file(to)
-        ready_file(plot, "--plot")
-        runs = Trajectories.read(data, ndof, units=_units(unit), order=order, period=period, observed=observed)
-        out.print(f"{len(runs.runs)} trajectories, {runs.n_points} points, {runs.ndof} degree(s) of freedom")
-        options = asked(ctx, "dt noise period separable family loss seed time_budget checkpoint resume")
-        options["damping"] = "quadratic" if drag else damping
-        found = drive in (None, "find")
-        options["drive"] = bool(drive) if found else parsed("--drive", drive, float, "an angular frequency, or find")
-        masses = parsed("--mass", mass, numbers, "a number, or numbers with commas, as 1,2.5")
-        options["mass"] = masses[0] if masses and len(masses) == 1 else masses
-        flow = learn_flow(runs, known=_known(known), progress=not quiet, **options)
-        flow.save(to)
-        cells = "{model} {parameters} {held_out_loss:.4g} {correlation:.2f}"
-        titles = ("model", "numbers", "held-out loss", "correlation")
-        print_table(titles, [[form.format(**h) for form in cells.split()] for h in flow.history])
-        learned = flow.recipe["learned"]
-        out.print(f"Chosen: {learned['model']}, for {learned['reason']}", markup=False)
-        formula = learned.get("physical")
-        show("H is the flow's own, of no formula." if formula is None else f"H = {formula}")
-        if learned.get("drag"):
-            show(f"drag = {', '.join(learned['drag'])}")
-        if flow.system.friction:
-            show(f"damping = {flow.system.friction.damping.tolist()}")
-        shown = {k: v for k, v in flow.figures.items() if k.startswith(("held_out_error", "noise", "energy_scatter"))}
-        out.print(", ".join(f"{k} = {v:.3g}" for k, v in shown.items() if v is not None))
-        out.print(f"Written: {to}")
-        if plot is not None:
-            from sympflow.learning.figures import held_out_figure
+    if damping and drag:
+        raise ValueError("`--drag` is learned in place of `--damping`: leave out one of them.")
+    ready_file(to)
+    ready_file(plot, "--plot")
+    runs = Trajectories.read(data, ndof, units=_units(unit), order=order, period=period, observed=observed)
+    out.print(f"{len(runs.runs)} trajectories, {runs.n_points} points, {runs.ndof} degree(s) of freedom")
+    options = asked(ctx, "dt noise period separable family loss seed time_budget checkpoint resume")
+    options["damping"] = "quadratic" if drag else damping
+    found = drive in (None, "find")
+    options["drive"] = bool(drive) if found else parsed("--drive", drive, float, "an angular frequency, or find")
+    masses = parsed("--mass", mass, numbers, "a number, or numbers with commas, as 1,2.5")
+    options["mass"] = masses[0] if masses and len(masses) == 1 else masses
+    flow = learn_flow(runs, known=_known(known), progress=not quiet, **options)
+    flow.save(to)
+    cells = "{model} {parameters} {held_out_loss:.4g} {correlation:.2f}"
+    titles = ("model", "numbers", "held-out loss", "correlation")
+    print_table(titles, [[form.format(**h) for form in cells.split()] for h in flow.history])
+    learned = flow.recipe["learned"]
+    out.print(f"Chosen: {learned['model']}, for {learned['reason']}", markup=False)
+    formula = learned.get("physical")
+    show("H is the flow's own, of no formula." if formula is None else f"H = {formula}")
+    if learned.get("drag"):
+        show(f"drag = {', '.join(learned['drag'])}")
+    if flow.system.friction:
+        show(f"damping = {flow.system.friction.damping.tolist()}")
+    shown = {k: v for k, v in flow.figures.items() if k.startswith(("held_out_error", "noise", "energy_scatter"))}
+    out.print(", ".join(f"{k} = {v:.3g}" for k, v in shown.items() if v is not None))
+    out.print(f"Written: {to}")
+    if plot is not None:
+        from sympflow.learning.figures import held_out_figure
 
-            held_out_figure(flow, runs.split(seed=seed)[1]).savefig(plot, dpi=110)
-            out.print(f"Written: {plot}")
+        held_out_figure(flow, runs.split(seed=seed)[1]).savefig(plot, dpi=110)
+        out.print(f"Written: {plot}")
 
 
 def _units(given: list[str] | None) -> dict[str, str]:

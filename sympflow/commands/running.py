@@ -11,7 +11,7 @@ from typer import Option
 
 from sympflow.arguments import MAX_ASKED_VALUES, check_counts
 from sympflow.commands import completion, console, words
-from sympflow.commands.console import Quiet, asked, out, print_table, ready_file, reporting, show
+from sympflow.commands.console import Quiet, asked, out, print_table, ready_file, show
 from sympflow.commands.words import Count, File, Number, OneMethod, Own, State, Step, Systems, TEnd, Text, TStart
 
 
@@ -58,34 +58,33 @@ def solve(
 
       sympflow solve kepler --method kahan_li8 --t-end 1e6 --save-every 1000 --store kepler.zarr --resume --progress
     """
-    with reporting(ctx):
-        from sympflow.metrics.energy import max_energy_error
-        from sympflow.solver import solve as solve_system
+    from sympflow.metrics.energy import max_energy_error
+    from sympflow.solver import solve as solve_system
 
-        if to is not None and to.suffix not in (".csv", ".npz"):
-            raise ValueError(f"`--out` must end in .csv or .npz; got {str(to)!r}.")
-        scene = words.one_scene(system, own)
-        chosen = None if method_name is None else words.configured(method_name)
-        span = words.interval(scene, t_start, t_end)
-        times = None if n_outputs is None else _instants(*span, n_outputs)
-        ready_file(to)
-        options = asked(ctx, "dt tol tol_of save_every store checkpoint_every backend resume")
-        options["progress"] = progress and not quiet
-        sol = solve_system(scene.system, chosen, span, words.state(y0), t_eval=times, **options)
-        if to is not None:
-            console.write_solution(sol, to)
-        worst = "" if store is None else f" in {store}"
-        if store is None and scene.system.shows_energy:
-            worst = f", largest energy error {max_energy_error(sol) if len(sol.t) else np.nan:.2e}"
-        out.print(console.in_options(sol.message, ctx), markup=False)
-        out.print(f"{len(sol.t)} outputs{worst}")
-        out.print(", ".join(f"{k} = {v:.4g}" if isinstance(v, float) else f"{k} = {v}" for k, v in sol.stats.items()))
-        if store is None and len(sol.t):
-            show(f"y({sol.t[-1]:g}) = [{', '.join(f'{x:.12g}' for x in sol.y[:, -1])}]")
-        if to is not None:
-            out.print(f"Written: {to}")
-        if not sol.success:
-            raise typer.Exit(1)
+    if to is not None and to.suffix not in (".csv", ".npz"):
+        raise ValueError(f"`--out` must end in .csv or .npz; got {str(to)!r}.")
+    scene = words.one_scene(system, own)
+    chosen = None if method_name is None else words.configured(method_name)
+    span = words.interval(scene, t_start, t_end)
+    times = None if n_outputs is None else _instants(*span, n_outputs)
+    ready_file(to)
+    options = asked(ctx, "dt tol tol_of save_every store checkpoint_every backend resume")
+    options["progress"] = progress and not quiet
+    sol = solve_system(scene.system, chosen, span, words.state(y0), t_eval=times, **options)
+    if to is not None:
+        console.write_solution(sol, to)
+    worst = "" if store is None else f" in {store}"
+    if store is None and scene.system.shows_energy:
+        worst = f", largest energy error {max_energy_error(sol) if len(sol.t) else np.nan:.2e}"
+    out.print(console.in_options(sol.message, ctx), markup=False)
+    out.print(f"{len(sol.t)} outputs{worst}")
+    out.print(", ".join(f"{k} = {v:.4g}" if isinstance(v, float) else f"{k} = {v}" for k, v in sol.stats.items()))
+    if store is None and len(sol.t):
+        show(f"y({sol.t[-1]:g}) = [{', '.join(f'{x:.12g}' for x in sol.y[:, -1])}]")
+    if to is not None:
+        out.print(f"Written: {to}")
+    if not sol.success:
+        raise typer.Exit(1)
 
 
 def _instants(start: float, end: float, n_outputs: int) -> np.ndarray:
@@ -155,25 +154,24 @@ def train(
 
       sympflow train quartic.toml --out quartic.safetensors
     """
-    with reporting(ctx):
-        from sympflow.training.trainer import train as train_flow
+    from sympflow.training.trainer import train as train_flow
 
-        scene = words.one_scene(system, own)
-        options = asked(ctx, "kind stages processor pairs activation optimizer steps points learning_rate restarts")
-        options |= asked(ctx, "residual_weight matching_weight label_weight time_budget workers seed checkpoint resume")
-        if hidden is not None:
-            whole = "whole numbers separated by commas"
-            options["hidden"] = tuple(words.parsed("--hidden", hidden, lambda text: words.numbers(text, int), whole))
-        to = to or Path(f"{scene.key}-{kind or 'sympflow'}.safetensors")
-        if to.suffix != ".safetensors":
-            raise ValueError(f"`--out` must end in .safetensors; got {str(to)!r}.")
-        ready_file(to)
-        ready_file(checkpoint, "--checkpoint")
-        flow = train_flow(scene.system, dt, **options)
-        flow.save(to)
-        rows = [(k.replace("_", " "), f"{v:.3g}" if isinstance(v, float) else str(v)) for k, v in flow.figures.items()]
-        print_table(("figure", "value"), rows)
-        out.print(f"Written: {to}. Use it with: sympflow compare {(system or own or [''])[0]} --methods {to},verlet")
+    scene = words.one_scene(system, own)
+    options = asked(ctx, "kind stages processor pairs activation optimizer steps points learning_rate restarts")
+    options |= asked(ctx, "residual_weight matching_weight label_weight time_budget workers seed checkpoint resume")
+    if hidden is not None:
+        whole = "whole numbers separated by commas"
+        options["hidden"] = tuple(words.parsed("--hidden", hidden, lambda text: words.numbers(text, int), whole))
+    to = to or Path(f"{scene.key}-{kind or 'sympflow'}.safetensors")
+    if to.suffix != ".safetensors":
+        raise ValueError(f"`--out` must end in .safetensors; got {str(to)!r}.")
+    ready_file(to)
+    ready_file(checkpoint, "--checkpoint")
+    flow = train_flow(scene.system, dt, **options)
+    flow.save(to)
+    rows = [(k.replace("_", " "), f"{v:.3g}" if isinstance(v, float) else str(v)) for k, v in flow.figures.items()]
+    print_table(("figure", "value"), rows)
+    out.print(f"Written: {to}. Use it with: sympflow compare {(system or own or [''])[0]} --methods {to},verlet")
 
 
 def certificate(
@@ -208,27 +206,26 @@ def certificate(
 
       sympflow certificate quartic.toml --flow quartic.safetensors --out certified.safetensors
     """
-    with reporting(ctx):
-        from sympflow.flow.files import load
-        from sympflow.flow.shipped import choose, named
-        from sympflow.studies.reports import write_json
+    from sympflow.flow.files import load
+    from sympflow.flow.shipped import choose, named
+    from sympflow.studies.reports import write_json
 
-        if to is not None and to.suffix not in (".json", ".safetensors"):
-            raise ValueError(f"`--out` must end in .json or .safetensors; got {str(to)!r}.")
-        scene = words.one_scene(system, own)
-        if flow_name is None:
-            flow = choose(scene.system).load(scene.system)
-        elif flow_name.endswith(".safetensors"):
-            flow = load(flow_name, system=scene.system)
+    if to is not None and to.suffix not in (".json", ".safetensors"):
+        raise ValueError(f"`--out` must end in .json or .safetensors; got {str(to)!r}.")
+    scene = words.one_scene(system, own)
+    if flow_name is None:
+        flow = choose(scene.system).load(scene.system)
+    elif flow_name.endswith(".safetensors"):
+        flow = load(flow_name, system=scene.system)
+    else:
+        flow = named(flow_name).load(scene.system)
+    ready_file(to)
+    end = t_end if scene.t_end is None else scene.t_end
+    found = flow.certificate(scene.system, t_end=end, **asked(ctx, "states times held_out seed"))
+    show(str(found))
+    if to is not None:
+        if to.suffix == ".json":
+            write_json(found.to_dict(), to)
         else:
-            flow = named(flow_name).load(scene.system)
-        ready_file(to)
-        end = t_end if scene.t_end is None else scene.t_end
-        found = flow.certificate(scene.system, t_end=end, **asked(ctx, "states times held_out seed"))
-        show(str(found))
-        if to is not None:
-            if to.suffix == ".json":
-                write_json(found.to_dict(), to)
-            else:
-                flow.save(to)
-            out.print(f"Written: {to}")
+            flow.save(to)
+        out.print(f"Written: {to}")

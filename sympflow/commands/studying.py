@@ -11,7 +11,7 @@ from typer import Option
 
 from sympflow.arguments import check_counts
 from sympflow.commands import completion, console, words
-from sympflow.commands.console import Quiet, asked, out, progress, ready_folder, reporting, show
+from sympflow.commands.console import Quiet, asked, out, progress, ready_folder, show
 from sympflow.commands.words import Count, File, Number, OneMethod, Own, State, Step, Systems, TEnd, Text, TStart
 
 Methods = Annotated[
@@ -67,29 +67,28 @@ def compare(
 
       sympflow compare pendulum --methods verlet,kahan_li8:dt=0.5,rk45:rtol=1e-8 --match evaluations
     """
-    with reporting(ctx):
-        from sympflow.studies.comparison import combined_table
-        from sympflow.studies.comparison import compare as compare_methods
+    from sympflow.studies.comparison import combined_table
+    from sympflow.studies.comparison import compare as compare_methods
 
-        chosen = words.methods(method_names)
-        found = words.scenes(systems, own)
-        options = asked(ctx, "dt n_outputs repeats match backend") | {"y0": words.state(y0)}
-        measured = None if metrics is None else words.listed(metrics)
-        ready_folder(to)
+    chosen = words.methods(method_names)
+    found = words.scenes(systems, own)
+    options = asked(ctx, "dt n_outputs repeats match backend") | {"y0": words.state(y0)}
+    measured = None if metrics is None else words.listed(metrics)
+    ready_folder(to)
+    with progress() as say:
+        options["progress"] = say
+        spans = [words.interval(scene, t_start, t_end) for scene in found]
+        comparisons = [
+            compare_methods(scene.system, chosen, measured, t_span=span, **options)
+            for scene, span in zip(found, spans, strict=True)
+        ]
+    show(combined_table(comparisons, out.width if out.is_terminal else None))
+    if to is not None:
         with progress() as say:
-            options["progress"] = say
-            spans = [words.interval(scene, t_start, t_end) for scene in found]
-            comparisons = [
-                compare_methods(scene.system, chosen, measured, t_span=span, **options)
-                for scene, span in zip(found, spans, strict=True)
-            ]
-        show(combined_table(comparisons, out.width if out.is_terminal else None))
-        if to is not None:
-            with progress() as say:
-                written = console.write_comparisons(comparisons, found, to, say)
-            console.tell(to, written)
-        if not any(row.status == "ok" for c in comparisons for row in c.rows):
-            raise typer.Exit(1)
+            written = console.write_comparisons(comparisons, found, to, say)
+        console.tell(to, written)
+    if not any(row.status == "ok" for c in comparisons for row in c.rows):
+        raise typer.Exit(1)
 
 
 def bench(
@@ -119,25 +118,24 @@ def bench(
 
       sympflow bench pendulum --methods verlet,kahan_li8,dop853 --batch 0 --t-end 50
     """
-    with reporting(ctx):
-        from sympflow.show.style import save
-        from sympflow.studies.precision import work_precision
+    from sympflow.show.style import save
+    from sympflow.studies.precision import work_precision
 
-        chosen = words.methods(method_names)
-        found = words.scenes(systems, own)
-        options = asked(ctx, "n_outputs repeats budget backend") | {"y0": words.state(y0)}
-        ready_folder(to)
-        for scene in found:
-            many = (1000 if batch is None and scene.system.domain is not None else batch) or None
-            span = words.interval(scene, t_start, t_end)
-            with progress() as say:
-                report = work_precision(scene.system, chosen, t_span=span, batch=many, progress=say, **options)
-            show(report.table())
-            if to is not None:
-                name = f"{scene.key}-work-precision"
-                written = [report.to_csv(to / f"{name}.csv"), report.to_json(to / f"{name}.json")]
-                figures = {to / f"{name}.png": report.measure, to / f"{name}-state.png": "error"}
-                console.tell(to, written + [save(report.figure(measure), path) for path, measure in figures.items()])
+    chosen = words.methods(method_names)
+    found = words.scenes(systems, own)
+    options = asked(ctx, "n_outputs repeats budget backend") | {"y0": words.state(y0)}
+    ready_folder(to)
+    for scene in found:
+        many = (1000 if batch is None and scene.system.domain is not None else batch) or None
+        span = words.interval(scene, t_start, t_end)
+        with progress() as say:
+            report = work_precision(scene.system, chosen, t_span=span, batch=many, progress=say, **options)
+        show(report.table())
+        if to is not None:
+            name = f"{scene.key}-work-precision"
+            written = [report.to_csv(to / f"{name}.csv"), report.to_json(to / f"{name}.json")]
+            figures = {to / f"{name}.png": report.measure, to / f"{name}-state.png": "error"}
+            console.tell(to, written + [save(report.figure(measure), path) for path, measure in figures.items()])
 
 
 def stability(
@@ -173,28 +171,27 @@ def stability(
 
       sympflow stability henon-heiles-escape --out out/
     """
-    with reporting(ctx):
-        from sympflow.studies.step_stability import stability as find_stability
+    from sympflow.studies.step_stability import stability as find_stability
 
-        chosen = words.methods(method_names)
-        found = words.scenes(systems, own)
-        options = asked(ctx, "bound limits") | {"dtypes": words.listed(dtypes), "metrics": words.listed(metrics)}
-        options["steps"] = words.parsed("--steps", steps, words.numbers, "numbers separated by commas")
-        ready_folder(to)
-        for scene in found:
-            family = [scene.system]
-            if vary is not None:
-                name, values = words.varied(scene, vary)
-                family = [scene.factory(**(scene.params | {name: value})) for value in values]
-            span = None if (scene.t_end, t_start, t_end) == (None,) * 3 else words.interval(scene, t_start, t_end)
-            with progress() as say:
-                report = find_stability(family, chosen, t_span=span, y0=words.state(y0), progress=say, **options)
-            show(report.table())
-            if to is not None:
-                written = report.to_csv(to / f"{scene.key}-stability.csv")
-                picture = to / f"{scene.key}-stability.png"
-                report.plot(picture)
-                console.tell(to, [written, picture])
+    chosen = words.methods(method_names)
+    found = words.scenes(systems, own)
+    options = asked(ctx, "bound limits") | {"dtypes": words.listed(dtypes), "metrics": words.listed(metrics)}
+    options["steps"] = words.parsed("--steps", steps, words.numbers, "numbers separated by commas")
+    ready_folder(to)
+    for scene in found:
+        family = [scene.system]
+        if vary is not None:
+            name, values = words.varied(scene, vary)
+            family = [scene.factory(**(scene.params | {name: value})) for value in values]
+        span = None if (scene.t_end, t_start, t_end) == (None,) * 3 else words.interval(scene, t_start, t_end)
+        with progress() as say:
+            report = find_stability(family, chosen, t_span=span, y0=words.state(y0), progress=say, **options)
+        show(report.table())
+        if to is not None:
+            written = report.to_csv(to / f"{scene.key}-stability.csv")
+            picture = to / f"{scene.key}-stability.png"
+            report.plot(picture)
+            console.tell(to, [written, picture])
 
 
 def section(
@@ -249,40 +246,39 @@ def section(
 
       sympflow section duffing --method kahan_li8 --orbits 100 --t-end 2000 --since 200 --out out/
     """
-    with reporting(ctx):
-        from sympflow.show.style import save
-        from sympflow.studies.poincare import names, poincare_section
+    from sympflow.show.style import save
+    from sympflow.studies.poincare import names, poincare_section
 
-        scene = words.one_scene(system, own)
-        chosen = None if method_name is None else words.configured(method_name)
-        span = words.interval(scene, t_start, t_end)
-        start = None if energy is not None and not y0 else _starts(scene, y0, orbits, seed)
-        if direction is not None and direction not in DIRECTIONS:
-            raise ValueError(f"`--direction` must be one of {', '.join(DIRECTIONS)}; got {direction!r}.")
-        pair = [word.strip() for word in axes.split(",")] if axes is not None else [None, None]
-        if len(pair) != 2 or not {*pair} <= {None, *names(scene.system.ndof)}:
-            known = ", ".join(names(scene.system.ndof))
-            raise ValueError(f"`--axes` must be two of {known}, separated by a comma; got {axes!r}.")
-        check_counts(limit=limit)
-        ready_folder(to)
-        options = asked(ctx, "dt tol coordinate level sample period energy")
-        if direction is not None:
-            options["direction"] = DIRECTIONS[direction]
-        if energy is not None:
-            options |= {"n": orbits, "seed": seed}
-        with progress() as say:
-            say(f"{scene.key}: {method_name or 'section'}")
-            found = poincare_section(scene.system, chosen, span, start, **options)
-        if since is not None:
-            found = found.since(since)
-        show(found.table(limit))
-        if to is not None:
-            name = to / f"{scene.key}-section"
-            figure = found.figure(pair[0], pair[1], turn)
-            files = [found.to_csv(f"{name}.csv"), found.to_json(f"{name}.json"), save(figure, Path(f"{name}.png"))]
-            console.tell(to, files)
-        if not found.success:
-            raise typer.Exit(1)
+    scene = words.one_scene(system, own)
+    chosen = None if method_name is None else words.configured(method_name)
+    span = words.interval(scene, t_start, t_end)
+    start = None if energy is not None and not y0 else _starts(scene, y0, orbits, seed)
+    if direction is not None and direction not in DIRECTIONS:
+        raise ValueError(f"`--direction` must be one of {', '.join(DIRECTIONS)}; got {direction!r}.")
+    pair = [word.strip() for word in axes.split(",")] if axes is not None else [None, None]
+    if len(pair) != 2 or not {*pair} <= {None, *names(scene.system.ndof)}:
+        known = ", ".join(names(scene.system.ndof))
+        raise ValueError(f"`--axes` must be two of {known}, separated by a comma; got {axes!r}.")
+    check_counts(limit=limit)
+    ready_folder(to)
+    options = asked(ctx, "dt tol coordinate level sample period energy")
+    if direction is not None:
+        options["direction"] = DIRECTIONS[direction]
+    if energy is not None:
+        options |= {"n": orbits, "seed": seed}
+    with progress() as say:
+        say(f"{scene.key}: {method_name or 'section'}")
+        found = poincare_section(scene.system, chosen, span, start, **options)
+    if since is not None:
+        found = found.since(since)
+    show(found.table(limit))
+    if to is not None:
+        name = to / f"{scene.key}-section"
+        figure = found.figure(pair[0], pair[1], turn)
+        files = [found.to_csv(f"{name}.csv"), found.to_json(f"{name}.json"), save(figure, Path(f"{name}.png"))]
+        console.tell(to, files)
+    if not found.success:
+        raise typer.Exit(1)
 
 
 def _starts(scene: words.Scene, y0: list[str] | None, orbits: int | None, seed: int) -> np.ndarray | None:
