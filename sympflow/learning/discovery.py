@@ -11,7 +11,7 @@ from __future__ import annotations
 import itertools
 import math
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, cast
 
@@ -24,10 +24,9 @@ from sympflow.flow.flow_map import FlowMap
 from sympflow.hamiltonian.domain import Box, Domain, EnergySublevel
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.learning.diagnosis import Reading, best_by_increments, hint
-from sympflow.learning.fitting import STEP_ERROR, limit_of, noise_of
+from sympflow.learning.fitting import STEP_ERROR, begins, limit_of, noise_of
 from sympflow.learning.library import Library, library_for
 from sympflow.learning.orbits import Method
-from sympflow.learning.reading import Run
 from sympflow.learning.shooting import Fit, Problem, chosen_method, minimized
 from sympflow.learning.smoothing import Smooth
 from sympflow.learning.trajectories import POINTS, Trajectories, periods_of
@@ -455,17 +454,11 @@ class _Search:
         self.methods: dict[bool, Method] = {}
         self.fits: dict[frozenset[int], Fit | None] = {}
 
-    def _cut(self, index: Iterable[int]) -> tuple[Trajectories, np.ndarray]:
+    def _cut(self, index: Sequence[int]) -> tuple[Trajectories, np.ndarray]:
         """Pieces of some trajectories, and the smoothed states (P, 2d) at their starts."""
-        starts: list[np.ndarray] = []
-        pieces: list[Run] = []
-        for i in index:
-            run = self.data.runs[i]
-            one = Trajectories((run,), self.data.names).pieces(span=self.piece).runs
-            at = np.cumsum([0, *(piece.n_points for piece in one[:-1])])
-            pieces += one
-            starts += list(self.smooth.states[i][:, at].T)
-        return replace(self.data, runs=tuple(pieces)), np.array(starts)
+        pieces = self.data.subset(index).pieces(span=self.piece)
+        states = np.concatenate([self.smooth.states[i] for i in index], axis=1)
+        return pieces, states[:, begins(pieces.runs)].T
 
     def run(self) -> Discovery:
         sigma = self.known if self.known is not None else np.maximum(self.smooth.sigma, 1e-2 * self.data.scales)
@@ -513,13 +506,13 @@ class _Search:
         different = [[*way] for way in {tuple(sorted(active)) for active in found}]
         ways = sorted(different, key=regression.criterion)[:STARTS]
         for _ in range(8):
-            starts = []
+            possible = []
             for active in ways:
                 self.guess = dict(zip(active, regression.coefficients(active), strict=True))
                 if self._fit(active, steps=steps) is not None:
-                    starts.append(active)
-            if starts:
-                return min(starts, key=self._criterion)
+                    possible.append(active)
+            if possible:
+                return min(possible, key=self._criterion)
             self.piece /= 2
             self._begin()
         raise ValueError(
@@ -765,18 +758,18 @@ class _Search:
         fit = self._known(chosen)
         if len(self.fitted) == len(self.data.runs):
             return fit
-        pieces, starts = self._cut(range(len(self.data.runs)))
-        return self._minimized(replace(fit.problem, data=pieces), fit.theta, starts) or fit
+        pieces, states = self._cut(range(len(self.data.runs)))
+        return self._minimized(replace(fit.problem, data=pieces), fit.theta, states) or fit
 
     def _model(self, active: list[int], sigma: np.ndarray, held_out: tuple[Trajectories, np.ndarray] | None) -> Model:
         fit = self._known(active)
         problem = replace(fit.problem, sigma=sigma)
         held = None
         if held_out is not None and not self.over():
-            pieces, starts = held_out
+            pieces, states = held_out
             frozen = replace(problem, data=pieces, frozen=True)
-            followed = minimized(frozen, fit.theta, starts, gain=CONVERGED, stop=self.over)
-            held = None if self.over() else _residual(followed.cost, pieces.n_values - starts.size)
+            followed = minimized(frozen, fit.theta, states, gain=CONVERGED, stop=self.over)
+            held = None if self.over() else _residual(followed.cost, pieces.n_values - states.size)
         return Model(
             self.library.subset(active).expressions,
             tuple(fit.theta.tolist()),
