@@ -216,7 +216,7 @@ class Row:
     singular: bool | None = None
     training_time: float | None = None
     break_even: float | None = None
-    figures: Mapping[str, float | None] = field(default_factory=dict)
+    figures: Mapping[str, float] = field(default_factory=dict)
 
     def __getattr__(self, name: str) -> float | None:
         if name not in FIGURES:
@@ -269,8 +269,8 @@ class Attempt:
         self.row = replace(self.row, **figures)
 
     def enter(self, **figures: float | None) -> None:
-        """Enter figures of metrics in the row."""
-        self.fill(figures={**self.row.figures, **figures})
+        """Enter figures of metrics in the row, but for those that could not be had."""
+        self.fill(figures={**self.row.figures, **{name: x for name, x in figures.items() if x is not None}})
 
     def run(self, run: Callable[[Any], Solution | Sequence[Solution]]) -> None:
         """Run the candidate's integrator once, and enter its counts; or the reason why there is no solution."""

@@ -127,7 +127,7 @@ def work_precision(
     for start in starts:
         conditions = Conditions(system, (t0, t1), start, t, backend)
         measured, truth = _measure(conditions, swept, repeats, budget, progress or (lambda text: None))
-        rows += break_even(measured, abs(t1 - t0), conditions.measure)
+        rows += break_even(measured, abs(t1 - t0), measure_of(system))
         references.append(truth)
     return WorkPrecision(system, (t0, t1), n_outputs, repeats, tuple(references), tuple(rows))
 
@@ -176,11 +176,6 @@ class Conditions:
     def trajectories(self) -> int:
         return self.y0.size // self.y0.shape[-1]
 
-    @property
-    def measure(self) -> str:
-        """The figure of a row by which methods are judged: see `measure_of`."""
-        return measure_of(self.system)
-
     def run(self, integrator: Any, t_span: tuple[float, float] | None = None, t: np.ndarray | None = None) -> Solution:
         """The solution from all initial states, or of a method that takes them one by one from a few.
 
@@ -219,7 +214,7 @@ def _measure(
             elif point.row.status == "ok":
                 attempts.accuracy(point, truth)
             before = error
-            error = _figure(point.row, conditions.measure)
+            error = _figure(point.row, measure_of(conditions.system))
             if point.row.status == "not applicable" or (error < floor and before < max(NEAR_FLOOR, 1e3 * floor)):
                 break
     say(f"{scene}: timing")
@@ -264,7 +259,8 @@ def _first(point: Attempt, conditions: Conditions) -> Attempt:
         force_evaluations=sol.stats["force_evaluations"] / share,
         hessian_evaluations=sol.stats["hessian_evaluations"] / share,
     )
-    point.measure([name for name in (kept_by(conditions.system),) if name])
+    if kept := kept_by(conditions.system):
+        point.measure([kept])
     return point
 
 

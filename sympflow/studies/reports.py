@@ -10,7 +10,7 @@ import os
 import unicodedata
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -141,13 +141,12 @@ def seconds(x: float | None) -> str:
     return f"{x * 1e9:.3g} ns"
 
 
-def write_csv(rows: Sequence[Any], path: str | os.PathLike[str], columns: Sequence[str] | None = None) -> Path:
-    """Write dataclass rows to a CSV file: one line for each, None as an empty cell, numbers to full precision."""
+def write_csv(rows: Sequence[Any], path: str | os.PathLike[str], columns: Sequence[str]) -> Path:
+    """Write these fields of rows to a CSV file: a line for each, None as an empty cell, numbers to full precision."""
     text = io.StringIO()
-    names = [f.name for f in fields(rows[0])] if columns is None else list(columns)
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(names)
-    for row in records(rows, names):
+    writer.writerow(columns)
+    for row in records(rows, columns):
         writer.writerow(["" if value is None else value for value in row.values()])
     return write_text(text.getvalue(), path)
 
