@@ -24,7 +24,7 @@ from sympflow.flow.flow_map import FlowMap
 from sympflow.hamiltonian.domain import Box, Domain, EnergySublevel
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.learning.diagnosis import Reading, best_by_increments, hint
-from sympflow.learning.fitting import STEP_ERROR, begins, limit_of, noise_of
+from sympflow.learning.fitting import STEP_ERROR, limit_of, noise_of
 from sympflow.learning.library import Library, library_for
 from sympflow.learning.orbits import Method
 from sympflow.learning.shooting import Fit, Problem, chosen_method, minimized
@@ -458,7 +458,7 @@ class _Search:
         """Pieces of some trajectories, and the smoothed states (P, 2d) at their starts."""
         pieces = self.data.subset(index).pieces(span=self.piece)
         states = np.concatenate([self.smooth.states[i] for i in index], axis=1)
-        return pieces, states[:, begins(pieces.runs)].T
+        return pieces, states[:, pieces.begins].T
 
     def run(self) -> Discovery:
         sigma = self.known if self.known is not None else np.maximum(self.smooth.sigma, 1e-2 * self.data.scales)

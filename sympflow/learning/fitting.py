@@ -161,13 +161,13 @@ def fitted(
         coarse = fit.step_error(np.maximum(sigma, EXACT * scales)) > STEP_ERROR
         finer = finer / 10 if coarse else finer
         spread = orbits.std(axis=1) if model.velocities else scales
-        longer = _span(made, data, orbits[:, begins(data.runs)].T, spread)
+        longer = _span(made, data, orbits[:, data.begins].T, spread)
         settled = np.allclose(sigma, before, rtol=SETTLED, atol=EXACT * scales.min())
         if longer <= 1.5 * span and settled and not coarse:
             break
         if longer > 1.5 * span:
             span, pieces = longer, _pieces(data, longer)
-        states = orbits[:, begins(pieces.runs)].T
+        states = orbits[:, pieces.begins].T
     assert made is not None
     return made
 
@@ -223,12 +223,7 @@ def _states(found: Fitted, data: Trajectories, pieces: Trajectories, sigma: np.n
     short = Problem(found.model, few, found.method, sigma, frozen=True, huber=setting.huber)
     starts = first_states(few, found.model, found.theta)
     orbits = minimized(short, found.theta, starts, iterations=20, patience=1, stop=setting.stop).orbits
-    return np.concatenate(orbits, axis=1)[:, begins(pieces.runs)].T
-
-
-def begins(runs: Sequence[Run]) -> np.ndarray:
-    """The places of the first points of runs among all points."""
-    return np.concatenate([[0], np.cumsum([run.n_points for run in runs])[:-1]])
+    return np.concatenate(orbits, axis=1)[:, pieces.begins].T
 
 
 def _span(found: Fitted, data: Trajectories, states: np.ndarray, spread: np.ndarray) -> float:
@@ -302,7 +297,7 @@ def judged(found: Fitted, held: Trajectories, setting: Setting) -> Held:
     fit = minimized(problem, found.theta, states, iterations=20, patience=1, stop=setting.stop)
     residuals = fit.residuals
     ends = np.cumsum([run.n_points for run in held.runs])
-    owner = np.searchsorted(ends, begins(pieces.runs), side="right")
+    owner = np.searchsorted(ends, pieces.begins, side="right")
     losses = np.zeros(len(held.runs))
     values = int(sum(np.isfinite(left).sum() for left in residuals))
     for i, left in zip(owner, residuals, strict=True):

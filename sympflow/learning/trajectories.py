@@ -206,6 +206,11 @@ class Trajectories(Answering):
         """The numbers that are not missing."""
         return int(sum(np.isfinite(run.y).sum() for run in self.runs))
 
+    @property
+    def begins(self) -> np.ndarray:
+        """The places (N,) of the first points of the trajectories among all points."""
+        return np.concatenate([[0], np.cumsum([run.n_points for run in self.runs])[:-1]])
+
     @cached_property
     def states(self) -> np.ndarray:
         """The states of all points of which nothing is missing: (n, 2d)."""
