@@ -94,6 +94,7 @@ class EventSearch:
         self.values: list[float] | None = None
         self.end: tuple[float, Array] | None = None  # the time and state of the terminal event that ended the run
         self.n_dense = 0  # evaluations of the dense output
+        self.project: Callable[[Array], Array] = lambda x: x  # of the states of the run to those that events are given
 
     def afresh(self) -> EventSearch:
         """Return a search for the same events that has found none."""
@@ -119,7 +120,7 @@ class EventSearch:
         """
         first = self.values is None
         if first:
-            self.values = [event.value(t_old, y_old) for event in self.events]
+            self.values = [event.value(t_old, self.project(y_old)) for event in self.events]
 
         def inside(s: float) -> Array:
             if s in (t, t_old):
@@ -139,7 +140,7 @@ class EventSearch:
     def _part(self, a: float, b: float, y_b: Array, inside: Dense, first: bool) -> bool:
         before = self.values
         assert before is not None
-        self.values = after = [event.value(b, y_b) for event in self.events]
+        self.values = after = [event.value(b, self.project(y_b)) for event in self.events]
         zeros: list[tuple[float, int]] = []
         for i, event in enumerate(self.events):
             if (before[i] or first) and event.crossed(before[i], after[i]):
@@ -148,7 +149,7 @@ class EventSearch:
             y = inside(t)
             followed = differentiable(y)
             y = detached(y)  # the time depends on y0 as well: a gradient through y alone is wrong
-            self.found[i].append((t, y))
+            self.found[i].append((t, self.project(y)))
             if len(self.found[i]) >= self.events[i].limit:
                 if followed:
                     warn(
@@ -169,7 +170,7 @@ class EventSearch:
         known = {a: g_a, b: g_b}
 
         def g(s: float) -> float:
-            return known[s] if s in known else event.value(s, inside(s))
+            return known[s] if s in known else event.value(s, self.project(inside(s)))
 
         from scipy.optimize import brentq  # half of the imports of a run, which most runs do without
 

@@ -1,7 +1,8 @@
-"""Lazy values: results kept with an object, and imports of plug-ins and of packages that may be missing."""
+"""Lazy values: results kept with an object, classes made by a call, imports of plug-ins and of what may be missing."""
 
 from __future__ import annotations
 
+import copyreg
 import sys
 from collections.abc import Callable, Container, Iterable
 from functools import wraps
@@ -43,6 +44,13 @@ def kept(make: Callable[Concatenate[K, P], T], most: float = inf) -> Callable[Co
 def lately_kept(make: Callable[Concatenate[K, P], T]) -> Callable[Concatenate[K, P], T]:
     """Make a function keep a few of its latest values, those of states for instance."""
     return kept(make, MOST_KEPT)
+
+
+class Made(type):
+    """The type of classes that no module holds: they pickle as the call `made_of`, a function and its arguments."""
+
+
+copyreg.pickle(Made, lambda cls: vars(cls).get("made_of", cls.__qualname__))  # a subclass is found by its name
 
 
 def needed(library: str, extra: str) -> str:

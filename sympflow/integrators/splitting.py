@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copyreg
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, replace
 from functools import cache, partial
@@ -12,7 +11,6 @@ import numpy as np
 
 from sympflow.arguments import check_flag, check_one_of, check_positive, warn
 from sympflow.arrays import Array, to_numpy, values
-from sympflow.events import EventSearch
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.time_transformation import checked_shift
 from sympflow.integrators.base import FixedStep
@@ -31,6 +29,7 @@ from sympflow.integrators.interpolants import Mapped
 from sympflow.integrators.loops import compiled_loops, stepper_by_mass, stepper_of
 from sympflow.integrators.methods import NAMES, TRIPLES
 from sympflow.integrators.steppers import Stepper
+from sympflow.lazy import Made
 from sympflow.schemes import CORRECTORS, POLYNOMIAL, SCHEMES, Scheme, checked_scheme, scheme_evaluations, scheme_named
 
 if TYPE_CHECKING:
@@ -384,29 +383,17 @@ APART = 0.1  # distance of two copies, over the size of the states of the run, b
 
 def _extended_run(run: Callable[[Problem], Outcome], extension: Composition, problem: Problem) -> Outcome:
     """The outcome of a problem that is run on an extended phase space."""
-    search = problem.events
-    lifted, before = None, []
-    if search is not None:  # which may go on from an earlier piece of the run
-        projected = (replace(e, g=lambda t, x, g=e.g: g(t, extension.project(x))) for e in search.events)  # type: ignore
-        lifted, before = EventSearch(tuple(projected), search.max_interval), search.found
-        lifted.found, lifted.values, lifted.n_dense = [[*zeros] for zeros in before], search.values, search.n_dense
-    store = problem.store
+    search, store = problem.events, problem.store
+    if search is not None:
+        search.project = extension.project
     if store is not None:
         store.project = lambda x: _noted(store, extension, x)
     stopped = None
     try:
-        outcome = run(replace(problem, y0=extension.lift(problem.y0), events=lifted))
+        outcome = run(replace(problem, y0=extension.lift(problem.y0)))
     except Interrupted as stop:
         outcome, stopped = stop.outcome, stop
     x = outcome.y
-    if search is not None and lifted is not None:
-        search.found = [
-            old + [(t, extension.project(y)) for t, y in zeros[len(old) :]]
-            for old, zeros in zip(before, lifted.found, strict=True)
-        ]
-        search.values = lifted.values
-        search.end = None if lifted.end is None else (lifted.end[0], extension.project(lifted.end[1]))
-        search.n_dense = lifted.n_dense
     outcome.y = extension.project(x)
     if outcome.sol is not None:
         outcome.sol = Mapped(outcome.sol, extension.project)
@@ -535,21 +522,9 @@ def method_of_row(name: str) -> type[Splitting]:
 
 @cache
 def _method_of(name: str, scheme: Scheme, splitting: str, clock: str) -> type[Splitting]:
-    cls = _new_class(_ByTable, name, scheme, splitting, clock, scheme.source)
-    cls._made_of = (name, scheme, splitting, clock)  # type: ignore[attr-defined]
+    cls = _new_class(Made, name, scheme, splitting, clock, scheme.source)
+    cls.made_of = _method_of, (name, scheme, splitting, clock)  # type: ignore[attr-defined]
     return cls
-
-
-class _ByTable(type):
-    """The type of classes that no module holds: they pickle as the table that they are made of."""
-
-
-def _reduced(cls: _ByTable) -> Any:
-    made_of = vars(cls).get("_made_of")
-    return cls.__qualname__ if made_of is None else (_method_of, made_of)  # a subclass is found by its name
-
-
-copyreg.pickle(_ByTable, _reduced)
 
 
 def _new_class(kind: type[type], name: str, scheme: Scheme, splitting: str, clock: str, source: str) -> type[Splitting]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copyreg
 import math
 from collections import Counter, deque
 from collections.abc import Callable
@@ -19,6 +18,7 @@ from sympflow.integrators.impulses import landings, spans
 from sympflow.integrators.registry import check_applies, naming_plugin
 from sympflow.integrators.steppers import Stepper
 from sympflow.interop.matching import Comparison, fixed_step
+from sympflow.lazy import Made
 
 if TYPE_CHECKING:
     from sympflow.flow.flow_map import FlowMap
@@ -65,23 +65,11 @@ def as_scipy(method: Any, system: HamiltonianSystem | None = None, **options: An
 def _solver_class(integrator: FixedStep, system: HamiltonianSystem | None) -> type[FlowSolver]:
     name = f"{integrator.name.title().replace('_', '')}Solver"
     namespace = {"integrator": integrator, "system": system, "__doc__": FlowSolver.__doc__}
-    return _SolverType(name, (FlowSolver,), namespace)  # type: ignore[return-value]
+    namespace["made_of"] = _solver_class, (integrator, system)
+    return Made(name, (FlowSolver,), namespace)  # type: ignore[return-value]
 
 
-class _SolverType(type):
-    """The type of the classes that `as_scipy` makes: they are pickled as what they were made of."""
-
-
-def _made_of(cls: type[FlowSolver]) -> Any:
-    """The recipe by which pickle makes the class again: its name, if it is the base class or a user's."""
-    made = {"integrator", "system"} <= set(vars(cls))
-    return (_solver_class, (cls.integrator, cls.system)) if made else cls.__qualname__
-
-
-copyreg.pickle(_SolverType, _made_of)  # type: ignore[arg-type]
-
-
-class FlowSolver(OdeSolver, metaclass=_SolverType):
+class FlowSolver(OdeSolver, metaclass=Made):
     """A fixed-step method of sympflow as a SciPy solver, on the grid t0 + k·dt. Made by `as_scipy`.
 
     Parameters
