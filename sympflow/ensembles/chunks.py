@@ -134,18 +134,23 @@ class Chunk:
 
     def states(self, times: np.ndarray) -> np.ndarray:
         """The states (n, 2d, m) at some times, NaN where an orbit has failed, which is noted."""
-        n, width = self.y0.shape
-        y = np.full((n, width, len(times)), np.nan)
-        if not self.integrator.on_grid:
-            for i in range(n):
-                self._run(y, times, np.array([i]))
-        elif self.compiled:
-            self._run(y, times, np.arange(n) if n > 1 else np.zeros(2, dtype=int))  # loops of one row round otherwise
-        else:
-            shift = self.first % BLOCK
-            for start in range(-shift, n, BLOCK):  # each row has its place, and rows beside it, in any chunk
-                self._run(y, times, np.clip(np.arange(start, start + BLOCK), 0, n - 1))
+        y = np.full((*self.y0.shape, len(times)), np.nan)
+        together = self.integrator.on_grid and self.compiled
+        for rows in self.blocks(together):
+            alone = together and len(rows) == 1  # of which loops round otherwise
+            self._run(y, times, np.zeros(2, dtype=int) if alone else rows)
         return y
+
+    def blocks(self, together: bool) -> Iterator[np.ndarray]:
+        """Rows that run together: all, or those that by array operations have the same neighbours in any chunk."""
+        n = len(self)
+        if together:
+            yield np.arange(n)
+        elif not self.integrator.on_grid:
+            yield from np.arange(n)[:, None]
+        else:
+            for start in range(-(self.first % BLOCK), n, BLOCK):
+                yield np.clip(np.arange(start, start + BLOCK), 0, n - 1)
 
     def _run(self, y: np.ndarray, times: np.ndarray, rows: np.ndarray) -> None:
         """Fill the states of some rows, each of them perhaps more than once."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from sympflow.arguments import check_counts
 from sympflow.compiler import NotCompiled
-from sympflow.ensembles.chunks import BLOCK, MOST_VALUES, Chunk
+from sympflow.ensembles.chunks import MOST_VALUES, Chunk
 from sympflow.ensembles.reductions import Fields, Reduction
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.metrics.chaos import ALIGNED, ALIGNMENT, NONE, VOLUME, check_followed, checked_threshold, indicator
@@ -24,18 +24,6 @@ NUMBER: tuple[tuple[int, ...], np.dtype] = ((), np.dtype(float))
 
 def _orbits(chunk: Chunk, rows: np.ndarray | slice = slice(None)) -> Orbits:
     return Orbits(chunk.system, chunk.integrator, chunk.t_span, chunk.y0[rows])
-
-
-def _blocks(chunk: Chunk, together: bool) -> Iterator[np.ndarray]:
-    """Rows that run together: all, or those that by array operations have the same neighbours in any chunk."""
-    n = len(chunk)
-    if together:
-        yield np.arange(n)
-    elif not chunk.integrator.on_grid:
-        yield from np.arange(n)[:, None]
-    else:
-        for start in range(-(chunk.first % BLOCK), n, BLOCK):
-            yield np.clip(np.arange(start, start + BLOCK), 0, n - 1)
 
 
 class _Indicator(Reduction):
@@ -65,7 +53,7 @@ class _Indicator(Reduction):
             together = chunk.backend != "array"
         except NotCompiled:
             together = False
-        for rows in _blocks(chunk, together):
+        for rows in chunk.blocks(together):
             found = indicator(_orbits(chunk, rows), backend=chunk.backend, **self.arguments)
             value[rows], time[rows] = found.value, found.t_end
             for i in set(rows[np.asarray(found.status) < 0].tolist()):
@@ -164,7 +152,7 @@ class Escape(Reduction):
     def reduce(self, chunk: Chunk) -> dict[str, np.ndarray]:
         region = region_of(self.outside, chunk.system)
         time, state = np.empty(len(chunk)), np.empty(chunk.y0.shape)
-        for rows in _blocks(chunk, together=False):
+        for rows in chunk.blocks(together=False):
             time[rows], state[rows], status = escapes(_orbits(chunk, rows), region, chunk.backend)
             for i in set(rows[status < 0].tolist()):
                 chunk.fail(i, "The orbit ceased to be finite before it was seen outside. Reduce `dt`.")
@@ -205,7 +193,7 @@ class PlaneCrossings(Reduction):
         count, times = np.zeros(n), np.full((n, self.most), np.nan)
         states = np.full((n, self.most, width), np.nan)
         plane = Plane(self.coordinate, float(self.level), self.direction)
-        for rows in _blocks(chunk, together=False):
+        for rows in chunk.blocks(together=False):
             found = crossings(chunk.integrator, chunk.system, chunk.t_span, chunk.y0[rows], plane, chunk.system.dt)
             ends = np.searchsorted(found.trajectory, np.arange(len(rows) + 1))
             for j, i in enumerate(rows.tolist()):

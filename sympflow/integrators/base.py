@@ -264,25 +264,23 @@ def run_and_search(integrator: Integrator, problem: Problem, search: EventSearch
             f"`events` are located on the dense output, which method {integrator.name!r} does not give: use another "
             "method."
         )
-    sign = 1 if problem.t1 >= problem.t0 else -1
     search.max_interval = search.max_interval or problem.system.dt
-    if len(full.t) == 1:
-        search.step(full.t[0], full.y[0], full.t[0], full.y[0], full.sol)
-    for k in range(len(full.t) - 1):
-        if search.step(float(full.t[k]), full.y[k], float(full.t[k + 1]), full.y[k + 1], full.sol):
+    every, times = full.t.tolist(), problem.t_eval
+    if times is None:
+        times = full.t[np.unique([*range(0, len(every), problem.save_every), len(every) - 1])]
+    record = Recorder(problem, times)
+    if len(every) == 1:
+        record.empty(every[0], full.y[0])
+    for k in range(len(every) - 1):
+        record.take(every[k], full.y[k], every[k + 1], full.y[k + 1], full.sol)
+        if search.end:
             break
-    t_end = search.end[0] if search.end else float(full.t[-1]) if full.status else problem.t1
-    if problem.t_eval is not None:
-        t = problem.t_eval[(problem.t_eval - t_end) * sign <= 0]
-        y = stack([full.sol(s) for s in t.tolist()], axis=0) if t.size else problem.y0[None][:0]
-    else:
-        keep = np.unique([*range(0, len(full.t), problem.save_every), len(full.t) - 1])
-        keep = keep[(full.t[keep] - t_end) * sign <= 0]
-        t, y = full.t[keep], full.y[keep]
-        if search.end and t[-1] != t_end:
-            t, y = np.append(t, t_end), stack([*y, search.end[1]], axis=0)
+    t, y = times[: len(record.outputs)], record.outputs
     if search.end:
         full.status, full.message = 1, ENDED
+        if problem.t_eval is None and t[-1] != search.end[0]:
+            t, y = np.append(t, search.end[0]), [*y, search.end[1]]
+    y = stack(y, axis=0) if y else problem.y0[None][:0]
     outcome = replace(full, t=t, y=y, sol=full.sol if problem.dense_output else None)
     if stopped and not search.end:
         raise Interrupted(outcome)
