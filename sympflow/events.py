@@ -168,9 +168,11 @@ class EventSearch:
         if g_b == 0:
             return b
         known = {a: g_a, b: g_b}
+        # a power of two, exact: Brent's products shall not underflow
+        unit = math.ldexp(1.0, min(-math.frexp(max(abs(g_a), abs(g_b)))[1], 1000))
 
         def g(s: float) -> float:
-            return known[s] if s in known else event.value(s, self.project(inside(s)))
+            return unit * (known[s] if s in known else event.value(s, self.project(inside(s))))
 
         from scipy.optimize import brentq  # half of the imports of a run, which most runs do without
 

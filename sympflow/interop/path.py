@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy.optimize import brentq
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from sympflow.arguments import warn
 from sympflow.arrays import differentiable, one_lane, readable, to_numpy, unfollowed, values_of_times
+from sympflow.events import Event, EventSearch
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep, Problem
 from sympflow.integrators.grid import Grid
@@ -187,7 +187,7 @@ class Path:
                 "call it outside of them, for one event at a time."
             )
         with torch.no_grad():
-            value = self._bracket(g)
+            value = self._located(g)
         s = zero = torch.tensor(value, dtype=torch.float64, device=self.y0.device)
         count, r = self.located(zero[None])
         start, inside = self(count.to(torch.float64) * self.h)[0], float(r[0])
@@ -208,36 +208,32 @@ class Path:
             s = s_next
         return s, state(s)
 
-    def _bracket(self, g: Callable[[Tensor, Tensor], Tensor]) -> float:
-        def value(s: float, y: Tensor) -> float:
-            return float(g(torch.tensor(s, dtype=torch.float64, device=y.device), y))
-
-        before = value(0.0, self.y0.detach())
-        if before == 0:
-            return 0.0
-        k, chunk, y, t0 = 0, 8, self.y0.detach(), unfollowed(self.start)
+    def _located(self, g: Callable[[Tensor, Tensor], Tensor]) -> float:
+        """The elapsed time of the first zero."""
+        y, t0 = self.y0.detach(), unfollowed(self.start)
+        event = Event(lambda s, y: g(torch.tensor(s, dtype=torch.float64, device=y.device), y), label="`event_fn`")
+        search, k, chunk = EventSearch((event,)), 0, 8
         while k < MAX_EVENT_STEPS:
             ahead = Path(self.integrator, self.system, y, 1 if self.h > 0 else -1, t0 + k * self.h)
             ahead.eager = self.eager  # the map whose derivatives follow, not a compiled copy of its weights
             states = ahead.rollout(np.arange(chunk + 1))
             inner = ahead._samples(states[:-1])
-            parts = inner.shape[1] + 1
             for j in range(chunk):
-                a = start = (k + j) * self.h
+                begin, t = (k + j) * self.h, ahead.t0 + j * self.h
                 if self.driven:
-                    self.system.check_times(ahead.t0, ahead.t0 + j * self.h)
-                for i in range(1, parts + 1):
-                    b, y_b = start + self.h * i / parts, inner[j, i - 1] if i < parts else states[j + 1]
-                    after = value(b, y_b)
-                    if np.sign(before) * np.sign(after) <= 0:  # the product itself may underflow
-                        t = ahead.t0 + j * self.h
-                        return self._locate(value, start, states[j], t, (a, before), (b, after))
-                    if not math.isfinite(after):
-                        raise RuntimeError(
-                            f"`event_fn` found no zero: the solution became non-finite after an elapsed time of "
-                            f"{a:.6g}. Check y0, or use a smaller dt."
-                        )
-                    a, before = b, after
+                    self.system.check_times(ahead.t0, t)
+
+                def inside(s: float, begin: float = begin, y: Tensor = states[j], t: float = t) -> Tensor:
+                    return self.step(y, s - begin, t)
+
+                search.step(begin, states[j], (k + j + 1) * self.h, states[j + 1], inside, inner[j])
+                if search.found[0]:
+                    return search.found[0][0][0]
+                if not np.isfinite(search.values).all():
+                    raise RuntimeError(
+                        f"`event_fn` found no zero: the solution became non-finite after an elapsed time of "
+                        f"{begin:.6g}. Check y0, or use a smaller dt."
+                    )
             k, y, chunk = k + chunk, states[-1], min(2 * chunk, 1024)
         raise RuntimeError(f"`event_fn` found no zero within {MAX_EVENT_STEPS:,} steps: check that there is one.")
 
@@ -249,28 +245,6 @@ class Path:
         fractions = torch.arange(1, parts, dtype=states.dtype, device=states.device) / parts
         h = (self.h * fractions).reshape(-1, *[1] * (states.ndim - 2)).expand(repeated.shape[:-1])
         return repeated if parts == 1 else self.step(repeated, h, self.times(torch.arange(len(states)), repeated))
-
-    def _locate(
-        self,
-        value: Callable[[float, Tensor], float],
-        start: float,
-        y: Tensor,
-        t: float,
-        left: tuple[float, float],
-        right: tuple[float, float],
-    ) -> float:
-        """The zero between two (s, g), in the step from y at `start`, the time t."""
-        (a, g_a), (b, g_b) = left, right
-        known = {a: g_a, b: g_b}
-        # a power of two, exact: Brent's own products shall not underflow, either
-        unit = math.ldexp(1.0, min(-math.frexp(max(abs(g_a), abs(g_b)))[1], 1000))
-
-        def f(s: float) -> float:
-            if s in known:
-                return known[s] * unit
-            return value(s, self.step(y, s - start, t)) * unit
-
-        return b if g_b == 0 else float(brentq(f, a, b, xtol=_EPS, rtol=_EPS))
 
 
 class DensePath(Path):
