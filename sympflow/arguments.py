@@ -241,12 +241,17 @@ def check_flag(name: str, value: Any) -> None:
         raise TypeError(f"`{name}` must be True or False; got {value!r}.")
 
 
+def any_array(values: Any) -> np.ndarray:
+    """Return values as an array, without entries where these are rows of different lengths."""
+    try:
+        return to_numpy(values)
+    except ValueError:
+        return np.empty(0, dtype=object)
+
+
 def floats(name: str, value: Any) -> np.ndarray:
     """`value` as an array of floats, if it is one of real numbers."""
-    try:
-        array = np.array(value)
-    except ValueError:  # rows of different lengths
-        array = np.empty(0, dtype=object)
+    array = any_array(value)
     if array.dtype.kind not in "fiu":
         raise TypeError(f"`{name}` must be made of real numbers; got {value!r}.")
     return array.astype(float)
@@ -297,10 +302,7 @@ def vector(name: str, value: ArrayLike) -> tuple[float, ...]:
 
 def checked_states(x: ArrayLike, width: int) -> np.ndarray:
     """`x`, checked to be numbers of shape (..., width)."""
-    try:
-        array = to_numpy(x)
-    except ValueError:  # rows of different lengths
-        array = np.empty(0, dtype=object)
+    array = any_array(x)
     if array.dtype.kind not in "fiu":
         raise TypeError(f"`x` must be states of real numbers; got {x!r}: pass an array of shape (..., {width}).")
     if array.ndim == 0 or array.shape[-1] != width:

@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from sympflow.arguments import did_you_mean
+from sympflow.arguments import any_array, did_you_mean
 from sympflow.ensembles.chunks import Chunk
 from sympflow.hamiltonian.scales import known_scale, size_of_terms
 from sympflow.hamiltonian.system import HamiltonianSystem
@@ -198,10 +198,7 @@ def _arrays(value: Any) -> dict[str, np.ndarray]:
     for name, v in named.items():
         if np.ma.is_masked(v):
             v = v.astype(np.result_type(v.dtype, float)).filled(np.nan)  # noqa: PLW2901
-        try:
-            array = np.asarray(v)
-        except ValueError:  # rows of different lengths
-            array = np.empty(0, dtype=object)
+        array = any_array(v)
         whole = array.dtype.kind in "iu" or (array.dtype == object and all(isinstance(x, int) for x in array.flat))
         if whole and array.size and max(-int(array.min()), int(array.max())) > EXACT:
             raise ValueError(

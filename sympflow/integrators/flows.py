@@ -27,7 +27,7 @@ from sympflow.integrators.clocks import (
     step_of_length,
     transformed_system,
 )
-from sympflow.integrators.contract import Failure, Outcome, Problem, Steps
+from sympflow.integrators.contract import Failure, Integrator, Outcome, Problem
 from sympflow.integrators.domain_exit import check_start
 from sympflow.integrators.grid_runs import grid_run
 from sympflow.integrators.loops import compiled_loops, with_loops
@@ -56,14 +56,10 @@ def known(key: tuple[Any, ...], make: Callable[[], T]) -> T:
     return _KNOWN[key]
 
 
-_KINDS_OF_SYSTEM: dict[tuple[Any, ...], int] = {}
-
-
 @kept
-def kind_of(system: HamiltonianSystem) -> int:
-    """A number that systems with the same formula and the same flows share, by which flows that ship are kept."""
-    found = system.fingerprint, system.expression, tuple(f.name for f in shipped_flows(system))
-    return _KINDS_OF_SYSTEM.setdefault(found, len(_KINDS_OF_SYSTEM))
+def kind_of(system: HamiltonianSystem) -> tuple[Any, ...]:
+    """The formula and the flows that systems share for which the same flows are kept."""
+    return system.fingerprint, system.expression, tuple(f.name for f in shipped_flows(system))
 
 
 @kept
@@ -363,24 +359,14 @@ class MLPIntegrator(FlowIntegrator):
     )
     symplectic: ClassVar[bool] = False
 
-    def run(self, problem: Problem) -> Outcome:
-        _check_forwards(problem.t0, problem.t1)
-        return super().run(problem)
+    inverse = Integrator.inverse
 
-    def steps(self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array) -> Steps:
-        _check_forwards(*t_span)
-        return super().steps(system, t_span, y0)
-
-    def inverse(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
-        raise TypeError("`method` 'mlp' has no exact inverse: use a symplectic method.")
-
-
-def _check_forwards(t0: float, t1: float) -> None:
-    """Raise a ValueError for a run backward in time."""
-    if t1 < t0:
-        raise ValueError(
-            "`t_span` runs backwards, but method 'mlp' has no inverse: use a symplectic method for backward time."
-        )
+    def own_stepper(self, problem: Problem) -> Stepper:
+        if problem.t1 < problem.t0:
+            raise ValueError(
+                "`t_span` runs backwards, but method 'mlp' has no inverse: use a symplectic method for backward time."
+            )
+        return super().own_stepper(problem)
 
 
 @dataclass(frozen=True)
