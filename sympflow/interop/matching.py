@@ -47,31 +47,33 @@ class Comparison:
         None for a flow that was given without a system.
     remedy : str
         The way to pass the same system twice.
+    given : callable
+        The right-hand side; a system is compared by its fingerprint at once, and a ValueError says that it is another.
 
     Attributes
     ----------
+    given : callable or None
+        None for the system itself, with which there is nothing to compare.
     states_compared : int
         States at which the method's own velocity was evaluated so far.
     known : bool
         True if an earlier run compared this very right-hand side, so that its start and end are enough.
     """
 
-    def __init__(self, argument: str, integrator: FixedStep, system: HamiltonianSystem | None, remedy: str) -> None:
+    def __init__(
+        self, argument: str, integrator: FixedStep, system: HamiltonianSystem | None, remedy: str, given: Any
+    ) -> None:
         self.argument, self.integrator, self.system, self.remedy = argument, integrator, system, remedy
         self.flow: Any = integrator.given_flow if system is None else integrator.flow_for(system)
         self.states_compared, self.known = 0, False
-        self._given: Any = None
         self._next, self._gap = FIRST_LOOK, FIRST_LOOK
-
-    def with_system(self, other: HamiltonianSystem) -> None:
-        """Raise a ValueError if a system that was passed as the right-hand side is another, by its fingerprint."""
-        mine = self.system
-        if mine is None or mine is other:
+        self.given = None if given is system else given
+        if system is None or given is system or not isinstance(given, HamiltonianSystem):
             return
-        if mine.ndof != other.ndof or not same_system(mine.fingerprint, other.fingerprint):
+        if system.ndof != given.ndof or not same_system(system.fingerprint, given.fingerprint):
             raise ValueError(
-                f"`{self.argument}` is not the system that method {self.integrator.name!r} solves: their Hamiltonians "
-                f"differ ({other!r} and {mine!r}). {self.remedy}"
+                f"`{argument}` is not the system that method {integrator.name!r} solves: their Hamiltonians differ "
+                f"({given!r} and {system!r}). {remedy}"
             )
 
     def with_flow(self, y: np.ndarray, t: float) -> None:
@@ -88,12 +90,10 @@ class Comparison:
         times = np.full(len(states), t)
         self._close_to_flow(times, states, self.system.vector_field(states, times))
 
-    def at_start(
-        self, fun: RightHandSide, y0: np.ndarray, t_span: tuple[float, float], given: Callable[..., Any] | None = None
-    ) -> None:
+    def at_start(self, fun: RightHandSide, y0: np.ndarray, t_span: tuple[float, float], remembers: bool = True) -> None:
         """Compare at several states and times: y0 (..., 2d), states around it, and states of the domain.
 
-        At y0 alone, if `given`, the function of the user, is remembered from a run with such states and times.
+        At y0 alone, if the function of the user is remembered from a run with such states and times.
 
         Raises
         ------
@@ -102,11 +102,11 @@ class Comparison:
         """
         t0 = t_span[0]
         self.at(t0, y0, fun(t0, y0), fun)
-        self.known = self._remembers(given, _bounds(t_span, [y0]))
+        self.known = remembers and self._remembers(_bounds(t_span, [y0]))
         if self.known:
             return
         probes = self._probes(y0)
-        self._given, self._bounds = given, _bounds(t_span, [y0, *probes])
+        self._bounds = _bounds(t_span, [y0, *probes]) if remembers else None
         for t, y in zip(_times(t_span, 16), probes, strict=False):
             slope = _quietly(fun, t, y)
             if slope is None:
@@ -123,14 +123,14 @@ class Comparison:
 
     def remember(self) -> None:
         """Remember the right-hand side, weakly, once all comparisons of a run have found it to be the system."""
-        if self.system is None or self._given is None or self.known:
+        if self.system is None or self.known or self._bounds is None:
             return
         try:
-            given = ref(self._given)
+            given = ref(self.given)
         except TypeError:
             return
-        known, key, bounds = _COMPARED.setdefault(self.system, {}), id(self._given), self._bounds
-        if key in known and known[key][0]() is self._given:
+        known, key, bounds = _COMPARED.setdefault(self.system, {}), id(self.given), self._bounds
+        if key in known and known[key][0]() is self.given:
             before = known[key][1]
             bounds = np.stack([np.minimum(before[0], bounds[0]), np.maximum(before[1], bounds[1])])
         if key not in known and len(known) >= MOST_FUNCTIONS:
@@ -138,12 +138,12 @@ class Comparison:
                 del known[dead]
         known[key] = given, bounds
 
-    def _remembers(self, given: Any, bounds: np.ndarray) -> bool:
-        """True if `given` was compared where these bounds of [t, q, p] lie within."""
-        if self.system is None or given is None or self.system not in _COMPARED:
+    def _remembers(self, bounds: np.ndarray) -> bool:
+        """True if the right-hand side was compared where these bounds of [t, q, p] lie within."""
+        if self.system is None or self.system not in _COMPARED:
             return False
-        function, known = _COMPARED[self.system].get(id(given), (None, bounds))
-        if function is None or function() is not given:
+        function, known = _COMPARED[self.system].get(id(self.given), (None, bounds))
+        if function is None or function() is not self.given:
             return False
         return bool((known[0] <= bounds[0]).all() and (known[1] >= bounds[1]).all())
 

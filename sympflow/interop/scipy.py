@@ -158,17 +158,14 @@ class FlowSolver(OdeSolver, metaclass=Made):
         if self._solved is not None and self._solved is not self.system:
             check_applies(integrator, self._solved)
         self.y = self.y.astype(float)
-        self._comparison = Comparison("fun", integrator, self._solved, REMEDY)
-        if isinstance(fun, HamiltonianSystem):
-            self._comparison.with_system(fun)
+        self._comparison = Comparison("fun", integrator, self._solved, REMEDY, fun)
         with np.errstate(all="ignore"):
             slope = np.asarray(self.fun(self.t, self.y), dtype=float)
         if slope.shape != self.y.shape:
             raise ValueError(f"`fun` must return shape {self.y.shape}, as `y0`; got {slope.shape}.")
         self._comparison.with_flow(self.y, self.t)
-        self._fun: Any = None if fun is self._solved else fun  # None: there is nothing to compare
-        if self._fun is not None:
-            self._comparison.at_start(self._slope, self.y, (self.t, self.t_bound), fun)
+        if self._comparison.given is not None:
+            self._comparison.at_start(self._slope, self.y, (self.t, self.t_bound))
         self._count_compared()
 
     def _begin(self) -> None:
@@ -180,7 +177,7 @@ class FlowSolver(OdeSolver, metaclass=Made):
     def _slope(self, t: float, y: np.ndarray) -> np.ndarray:
         """`fun` in the precision in which it answers."""
         self._counts.others += 1
-        return np.asarray(self._fun(t, y.copy()))
+        return np.asarray(self._comparison.given(t, y.copy()))
 
     def _count_compared(self) -> None:
         """Count the evaluations of the method's own velocity."""
@@ -233,7 +230,7 @@ class FlowSolver(OdeSolver, metaclass=Made):
             if self._k == grid.n_steps + bool(grid.remainder):
                 self.t = self._stop
             last = self.t == self.t_bound
-            if self._fun is not None and (last or self._comparison.is_due(self._k)):
+            if self._comparison.given is not None and (last or self._comparison.is_due(self._k)):
                 self._comparison.at(self.t, self.y, self._slope(self.t, self.y), self._slope, grid.t0)
                 self._count_compared()
                 if last:

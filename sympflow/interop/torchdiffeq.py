@@ -476,7 +476,7 @@ class _Compared:
         self, func: Any, y0: State, t: Tensor, integrator: FixedStep, system: HamiltonianSystem | None
     ) -> None:
         flow = integrator.given_flow
-        self.comparison = comparison = Comparison("func", integrator, system, _REMEDY)
+        self.comparison = comparison = Comparison("func", integrator, system, _REMEDY, func)
         y, self.pack = _joined(y0)
         start = one_lane(y).reshape(-1, y.shape[-1])[0]
         training = flow is not None and any(w.requires_grad or differentiable(w) for w in flow.parameters())
@@ -485,11 +485,9 @@ class _Compared:
         self.func: Any = None if func is system else _of_pairs(func, y0)
         if self.func is None:
             return
-        if isinstance(func, HamiltonianSystem):
-            comparison.with_system(func)
         self.like, self.times, self.t0 = y, t, float(one_lane(t)[0])
         span = self.t0, float(one_lane(t)[-1])
-        comparison.at_start(self._slope, one_lane(y), span, func if readable(y) and readable(t) else None)
+        comparison.at_start(self._slope, one_lane(y), span, readable(y) and readable(t))
 
     def _slope(self, t: float, y: np.ndarray) -> np.ndarray:
         """`func` at states like y0, in their precision and form."""

@@ -78,14 +78,10 @@ class Run:
         self._term, self._stats, self._args = term, stats, args
         self._starts, self._y0 = problem.t_start.detach(), problem.y0.detach()
         self._n_steps = 0
-        self._comparison = Comparison("term", method.integrator, method.system, _REMEDY)
-        self._known = term.f is method.system
-        if self._known:
-            return
-        if isinstance(term.f, HamiltonianSystem):
-            self._comparison.with_system(term.f)
-        span = float(self._starts[0]), float(self.ends[0])
-        self._comparison.at_start(self._at_fraction, to_numpy(self._y0), span)
+        self._comparison = Comparison("term", method.integrator, method.system, _REMEDY, term.f)
+        if self._comparison.given is not None:
+            span = float(self._starts[0]), float(self.ends[0])
+            self._comparison.at_start(self._at_fraction, to_numpy(self._y0), span, remembers=False)
 
     def _at_fraction(self, t: float, y: np.ndarray) -> np.ndarray:
         """The slopes of the term at t in the first sample, and as far on their way in the others."""
@@ -100,7 +96,7 @@ class Run:
     def compare(self, t: Tensor, y: Tensor, last: bool) -> None:
         """Compare the term at the states y at t, if a comparison is due or the steps from there are the last."""
         self._n_steps += 1
-        if not self._known and (self._comparison.is_due(self._n_steps) or last):
+        if self._comparison.given is not None and (self._comparison.is_due(self._n_steps) or last):
             t, y = t.detach(), y.detach()
             self._comparison.at(to_numpy(t), to_numpy(y), self._slopes(t, y), self._at_fraction, float(self._starts[0]))
 
