@@ -27,7 +27,7 @@ from sympflow.integrators.clocks import (
     step_of_length,
     transformed_system,
 )
-from sympflow.integrators.contract import Failure, Integrator, Outcome, Problem
+from sympflow.integrators.contract import Failure, Integrator, Outcome, Problem, Steps
 from sympflow.integrators.domain_exit import check_start
 from sympflow.integrators.grid_runs import grid_run
 from sympflow.integrators.loops import compiled_loops, with_loops
@@ -361,12 +361,21 @@ class MLPIntegrator(FlowIntegrator):
 
     inverse = Integrator.inverse
 
-    def own_stepper(self, problem: Problem) -> Stepper:
-        if problem.t1 < problem.t0:
-            raise ValueError(
-                "`t_span` runs backwards, but method 'mlp' has no inverse: use a symplectic method for backward time."
-            )
-        return super().own_stepper(problem)
+    def run(self, problem: Problem) -> Outcome:
+        _check_forwards(problem.t0, problem.t1)
+        return super().run(problem)
+
+    def steps(self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array) -> Steps:
+        _check_forwards(*t_span)
+        return super().steps(system, t_span, y0)
+
+
+def _check_forwards(t0: float, t1: float) -> None:
+    """Raise a ValueError for a run backward in time."""
+    if t1 < t0:
+        raise ValueError(
+            "`t_span` runs backwards, but method 'mlp' has no inverse: use a symplectic method for backward time."
+        )
 
 
 @dataclass(frozen=True)
