@@ -449,7 +449,7 @@ class Code:
     def table(self, table: Table) -> Value:
         """The address of the numbers of a table, which the linker is told by its symbol."""
         symbol = table.symbol
-        TABLES[symbol] = table
+        TABLES.setdefault(symbol, table)  # loaded code reads the first one, whose memory must stay
         self.module.declare(symbol, f"@{symbol} = external global double")
         self.module.declare(
             f"{symbol}.place", f"@{symbol}.place = internal externally_initialized global ptr @{symbol}"
