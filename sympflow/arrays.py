@@ -29,7 +29,7 @@ def as_tensor(x: Array) -> Array:
     """Return a tensor of the same numbers: itself, or of a copy of an array."""
     import torch
 
-    return x if is_tensor(x) else torch.as_tensor(np.array(x))
+    return x if isinstance(x, torch.Tensor) else torch.as_tensor(np.array(x))
 
 
 def as_array(x: Any) -> Array:

@@ -25,6 +25,7 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep
 from sympflow.integrators.contract import Integrator, Problem
 from sympflow.integrators.impulses import landings, run_in_pieces
+from sympflow.integrators.problems import check_y0
 from sympflow.integrators.registry import build, check_applies, get
 from sympflow.lazy import lately_kept
 from sympflow.systems.given import GivenSystem, given_system
@@ -240,14 +241,8 @@ def choose_step(
     >>> dt = sympflow.choose_step(sympflow.systems.henon_heiles(), "srkn11b", 1e-9)
     """
     system = given_system(system)
-    if y0 is None and system.y0 is None:
-        raise ValueError(
-            f"`y0` is needed: {system.title} has no initial state. Pass [q, p], {2 * system.ndof} numbers."
-        )
-    y = np.asarray(system.y0 if y0 is None else to_numpy(y0), dtype=float)
+    y = check_y0(system, system.y0 if y0 is None else to_numpy(y0), None)
     integrator = build(method, {}) if method is not None else choose_method(system, y, {}, flows=False)[0]
-    if y.ndim == 0 or y.shape[-1] != 2 * system.ndof:
-        raise ValueError(f"`y0` must have shape (..., {2 * system.ndof}), states [q, p]; got {y.shape}.")
     t0, t1 = check_t_span(system.t_span if t_span is None else t_span, False)
     return step_for(integrator, Problem(system, t0, t1, y), tol, tol_of)[0]
 

@@ -48,7 +48,7 @@ class Grid:
         return self.t1 if k == self.n_steps and self.remainder == 0 else self.t0 + k * self.h
 
     def place(self, t: float) -> tuple[int, float]:
-        """`locate` of one time, unchecked."""
+        """`locate` of one time."""
         x = (t - self.t0) / self.h
         nearest = round(x)
         if abs(x - nearest) <= 4 * EPS * (abs(nearest) + (abs(t) + abs(self.t0)) / abs(self.h)):
@@ -56,12 +56,8 @@ class Grid:
         count = math.floor(x)
         return count, t - (self.t0 + count * self.h)
 
-    def locate(self, t: np.ndarray, bounded: bool = True) -> tuple[np.ndarray, np.ndarray]:
+    def locate(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Counts k and signed remainders r with t = t0 + k·h + r, 0 ≤ r/h < 1."""
-        if bounded:
-            low, high = sorted((self.t0, self.t1))
-            if t.size and not (t.min() >= low and t.max() <= high):
-                raise ValueError(f"`t` must lie in [{low:g}, {high:g}], the interval that was solved.")
         x = (t - self.t0) / self.h
         nearest = np.rint(x)
         off, counts = np.abs(x - nearest), np.abs(nearest)
@@ -93,7 +89,7 @@ class Outputs:
             k, r = grid.place(float(t_eval[0]))
             self.count, self.remainder = np.array([k]), np.array([r])
         else:
-            self.count, self.remainder = grid.locate(t_eval, bounded=False)
+            self.count, self.remainder = grid.locate(t_eval)
         self.n, self.last = len(t_eval), int(self.count[-1]) if len(t_eval) else 0
 
     def up_to(self, k: int) -> int:

@@ -14,7 +14,6 @@ from sympflow.arrays import (
     differentiable,
     finite_states,
     full_of_nan,
-    is_tensor,
     library_name,
     like,
     stack,
@@ -185,7 +184,7 @@ def checked_state(y_next: Any, y: Array) -> Array:
     """Return the result of a step from y, checked to be of the same kind, shape and dtype: it may be a plug-in's."""
     shape = getattr(y_next, "shape", None)
     if shape == y.shape and y_next.dtype == y.dtype:
-        if is_tensor(y) and differentiable(y) and not (y_next.requires_grad or transformed(y)):
+        if differentiable(y) and not (y_next.requires_grad or transformed(y)):
             raise TypeError(
                 "`step` loses the gradient of the tensors that it is given: pass NumPy arrays, or y0.detach(). A class "
                 "whose step takes arrays only says so by `arrays_only`."
