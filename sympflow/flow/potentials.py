@@ -501,10 +501,10 @@ class MLPPotential(Potential):
 
     def trained(self) -> TrainedNetwork | None:
         """Return the network for compiled derivatives by its parameters; None if there are none."""
-        from sympflow.kernels.activations import SLOPES
+        from sympflow.kernels.activations import SIGMAS
         from sympflow.kernels.network_tangents import TrainedNetwork
 
-        if self.activation not in SLOPES or self.weight_x.dtype != torch.float64 or self.weight_x.device.type != "cpu":
+        if self.activation not in SIGMAS or self.weight_x.dtype != torch.float64 or self.weight_x.device.type != "cpu":
             return None
         inner = [*self.biases, *self.weights]
         units = [1 / self.scale.expand_as(self.weight_x), 1 / self.tau.expand_as(self.weight_t)]

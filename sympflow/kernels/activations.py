@@ -1,14 +1,15 @@
-"""Activations σ of networks: each with its slope, written with numbers of any kind; from these all that is compiled."""
+"""Activations σ of networks, written with numbers of any kind; from these all that is compiled."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache, partial
 from typing import Any
 
-from sympflow.compiler.functions import COMPOSED, apply, fma
-from sympflow.compiler.program import Program, gradient, traced
+from sympflow.compiler.functions import apply, fma
+from sympflow.compiler.program import Program, fused, gradient, traced
 
-__all__ = ["SLOPES", "bent"]
+__all__ = ["SIGMAS", "bent"]
 
 
 def _logistic(a: Any) -> Any:
@@ -16,37 +17,19 @@ def _logistic(a: Any) -> Any:
     return fma(0.5, apply("tanh", 0.5 * a), 0.5)
 
 
-def _tanh(a: Any) -> tuple[Any, Any]:
-    h = apply("tanh", a)
-    return h, fma(-h, h, 1.0)
-
-
-def _sigmoid(a: Any) -> tuple[Any, Any]:
-    h = _logistic(a)
-    return h, h * (1.0 - h)
-
-
-def _swish(a: Any) -> tuple[Any, Any]:
-    s = _logistic(a)
-    h = a * s
-    return h, fma(h, 1.0 - s, s)
-
-
-SLOPES: dict[str, Callable[[Any], tuple[Any, Any]]] = {
-    "tanh": _tanh,
-    "sin": lambda a: (apply("sin", a), apply("cos", a)),
-    "sigmoid": _sigmoid,
-    "softplus": lambda a: (COMPOSED["softplus"].value(a), _logistic(a)),
-    "logcosh": lambda a: (COMPOSED["logcosh"].value(a), apply("tanh", a)),
-    "swish": _swish,
+SIGMAS: dict[str, Callable[[Any], Any]] = {
+    **{name: partial(apply, name) for name in ("tanh", "sin", "softplus", "logcosh")},
+    "sigmoid": _logistic,
+    "swish": lambda a: a * _logistic(a),
 }
-"""The activations by name: functions of a number a that return σ(a) and σ'(a)."""
+"""The activations by name: functions of a number."""
 
 
+@cache
 def bent(name: str, orders: int) -> Program:
     """Return the program of σ(a), σ'(a), σ''(a) …, so many derivatives."""
-    program = traced(SLOPES[name], "a")
+    program = traced(lambda a: [SIGMAS[name](a)], "a")
     found = list(program.outputs)
     while len(found) <= orders:
         found += gradient(found[-1], program.inputs)
-    return Program(program.inputs, found)
+    return fused(Program(program.inputs, found))

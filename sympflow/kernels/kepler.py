@@ -46,7 +46,6 @@ MOST_GROUPS = 4  # whose pairs are written out
 TERMS, ROUGH, LONGEST = 9, 6, 2.0  # of the series of a drift, of the first one, and the βX² up to which they do
 AWAY = 1e3  # of the largest orbit: where lanes without a planet are
 WORK = 250  # nanoseconds of a stage
-ONE = np.ones(1, dtype=np.int64)
 REGISTER = Type("double", LANES)
 POWERS = np.array([1, 1, 3])  # of the step, with which the numbers of a column grow
 ROWS = ("Gm", "mu", "weight", "ratio", "over", "mass", "star", "share")
@@ -721,13 +720,9 @@ class KeplerKernel(Kernel):
         N, k, _ = vectors.shape
         code = self.loops.code(self.form._replace(vectors=k, compensated=False))
         lengths = np.broadcast_to(np.asarray(h, dtype=np.float64), (N,))
-        nothing = np.zeros((2, len(POWERS)))
         rows = np.concatenate([self.loops.rows(y), self.loops.rows(vectors, 0.0).reshape(N, k * code.whole)], axis=1)
-        start = np.concatenate([rows, np.arange(N, dtype=float)[:, None]], axis=1)
-        batch = Batch.whole(start, 1, ONE, code.n_out)
-        columns = self._table(lengths, (), self.before, self.substeps, self.after, nothing)
-        code.run(columns, batch, False)
-        rows = batch.out[:, 0].reshape(N, 1 + k, code.whole)
+        columns = self._table(lengths, (), self.before, self.substeps, self.after)
+        rows = code.single_steps(*columns, rows).states.reshape(N, 1 + k, code.whole)
         moved = self.loops.moved(rows[:, 1:], vectors, lengths[:, None])
         return self.loops.moved(rows[:, 0], y, lengths), moved.swapaxes(-1, -2)
 

@@ -24,18 +24,16 @@ from sympflow.compiler import NotCompiled, arrays_only
 from sympflow.compiler.control import DOUBLE, INT, POINTER, Type, Value
 from sympflow.compiler.functions import fma
 from sympflow.compiler.program import traced
-from sympflow.kernels.activations import SLOPES
-from sympflow.kernels.protocol import Batch, Kernel, Run, Steps, Task, both_ways, run_states
-from sympflow.kernels.rollouts import Columns, Rollouts, aligned
+from sympflow.kernels.activations import SIGMAS, bent
+from sympflow.kernels.protocol import Kernel, Run, Steps, Task, both_ways, run_states
+from sympflow.kernels.rollouts import ONE, Columns, Rollouts, aligned
 from sympflow.kernels.runs import Numbers, Room
-from sympflow.kernels.threads import run_rows
 from sympflow.lazy import needed
 
 __all__ = ["MLPFlowKernel", "NetworkLayer"]
 
 FEATURES = 4  # side by side in a register
 REGISTERS = 4  # of features, at most, that are computed together
-ONE = np.ones(1, dtype=np.int64)
 STEP = 1000  # about how many nanoseconds one takes
 
 
@@ -64,9 +62,9 @@ class MLPFlowKernel(Kernel):
     def __init__(self, ndof: int, layers: Sequence[NetworkLayer]) -> None:
         depths, activations = {len(layer.biases) for layer in layers}, {layer.activation for layer in layers}
         slopes = layers[0].slopes
-        if len(depths) > 1 or len(activations) > 1 or not (activations <= set(SLOPES) or slopes is not None):
+        if len(depths) > 1 or len(activations) > 1 or not (activations <= set(SIGMAS) or slopes is not None):
             raise arrays_only(
-                f"`flow` must have potentials of one depth with one activation out of {', '.join(SLOPES)}, or one "
+                f"`flow` must have potentials of one depth with one activation out of {', '.join(SIGMAS)}, or one "
                 "that was registered with `compiled`, to be compiled"
             )
         self._given = ndof, layers
@@ -85,9 +83,8 @@ class MLPFlowKernel(Kernel):
 
         def one_way(rows: Any, back: bool) -> np.ndarray:
             start, sign = np.concatenate([y[rows], np.abs(lengths[rows])[:, None]], axis=1), -1.0 if back else 1.0
-            batch = Batch.whole(start, 1, ONE, y.shape[1])
-            run_rows(lambda i, _: self._rollouts.run(sign, batch.rows(i.start, i.stop), False), len(start), STEP, None)
-            return batch.out[:, 0]
+            rollout, task = partial(self._rollouts.run, sign, closed=False), Task(0.0, y[rows], 1, ONE)
+            return run_states(rollout, task, y.shape[1], STEP, start).states[:, 0]
 
         return Steps(both_ways(one_way, lengths, y))
 
@@ -291,8 +288,8 @@ class _Impulse:
 
 def _slopes(layer: NetworkLayer) -> tuple[Callable[[Any], Any] | None, int]:
     """σ and σ' as a function of numbers; or None, and the address of a function of the user's that cannot be traced."""
-    if layer.activation in SLOPES:
-        return SLOPES[layer.activation], 0
+    if layer.activation in SIGMAS:
+        return bent(layer.activation, 1), 0
     function: Any = layer.slopes
     try:
         return traced(getattr(function, "py_func", function), "a"), 0

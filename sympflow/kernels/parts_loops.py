@@ -23,7 +23,7 @@ from sympflow.compiler.machine import address
 from sympflow.compiler.program import Program, gradient, tangent, traced
 from sympflow.hamiltonian.formulas import evaluator
 from sympflow.hamiltonian.parts import LINEAR, ExactParts, PartFunctions, SubFlow, shears
-from sympflow.kernels.protocol import Batch, Kernel, Run, Steps, Task, begun_in, run_states
+from sympflow.kernels.protocol import Kernel, Run, Steps, Task, begun_in, run_states
 from sympflow.kernels.rollouts import Columns, Rollouts, shared
 from sympflow.kernels.runs import Numbers, begun, finished
 from sympflow.kernels.stage_times import SymbolicLetters
@@ -38,7 +38,6 @@ __all__ = ["Maps", "PartsKernel", "PartsLoops", "parts_loops"]
 
 IDLE = -1  # code of no map
 WITH_GRADIENT = 100  # added to the code of a part that carries a force gradient
-ONE = np.ones(1, dtype=np.int64)
 TURN_WIDTH = 6  # numbers that turn a frequency
 TIME_WIDTH = 3  # numbers of a column for its time
 EARLY = -4  # when momenta are known before the positions, in cycles
@@ -325,12 +324,8 @@ class PartsLoops:
         maps, start = self._of(sequence), self.modes(y)
         codes, entries = self.table(sequence, len(y), maps)
         entries = self.timed(sequence, entries, t, h)
-        code, groups = self._singles(maps), [*((k,) for k in codes.tolist()), (IDLE,), (IDLE,)]
-        columns = code.columns(groups, np.concatenate([entries, 0 * entries[:, :1], 0 * entries[:, :1]], axis=1))
-        rows = np.concatenate([start, np.arange(len(y), dtype=float)[:, None]], axis=1)
-        batch = Batch.whole(rows, 1, ONE, start.shape[1])
-        code.run(columns, batch, False)
-        return self.states(batch.out[:, 0])
+        code = self._singles(maps)
+        return self.states(code.single_steps(*code.columns([(k,) for k in codes.tolist()], entries), start).states)
 
     def step_modes(self, sequence: Sequence[SubFlow], modes: np.ndarray) -> np.ndarray:
         """The maps applied once to every row [X, Y] of `modes` (N, 2d), which stay modes."""

@@ -15,8 +15,9 @@ from sympflow.compiler import NotCompiled
 from sympflow.compiler.control import Value
 from sympflow.compiler.machine import address, given
 from sympflow.compiler.program import Program, adjoint, traced
-from sympflow.kernels.protocol import Batch, begun_in, end_finite
+from sympflow.kernels.protocol import Batch, Steps, Task, begun_in, end_finite, run_states
 from sympflow.kernels.runs import BLOCK, Memory, Numbers, Room, Values, map_function, reverse_function, run_function
+from sympflow.kernels.stages import evaluated
 from sympflow.kernels.threads import NEVER
 
 __all__ = ["Columns", "Rollouts", "SplittingRollouts", "aligned", "filled", "shared", "zeros"]
@@ -24,6 +25,7 @@ __all__ = ["Columns", "Rollouts", "SplittingRollouts", "aligned", "filled", "sha
 LINE = 8  # numbers in a line of memory
 START, ONE = np.zeros(1, dtype=np.int64), np.ones(1, dtype=np.int64)
 AT_ONCE = 4096  # trajectories with tables of their own
+POWERS = np.array([1, 1, 3, 5])  # of the step, with which the numbers of a drift and a kick grow
 
 Columns = tuple[np.ndarray, np.ndarray]
 """The numbers (m, size) of columns and their kinds (m,), as compiled code reads them: see `run_function`."""
@@ -221,11 +223,11 @@ class Rollouts(ABC):
         """The addresses of the data."""
         return np.array([*map(address, self.data)], dtype=np.int64)
 
-    def call(self, name: str, width: int, *arguments: Any, n_out: int | None = None) -> None:
+    def call(self, name: str, width: int, *arguments: Any) -> None:
         """Call the compiled function of a name with arrays and integers."""
         if self.room is not None:
             work = aligned((3 * self.n_values + self.room) * width)
-            arguments = *arguments, self.n_values, self.n_out if n_out is None else n_out, work, self._places
+            arguments = *arguments, self.n_values, self.n_out, work, self._places
         self.function(name, width)(*given(arguments))
 
     def run(self, table: Any, batch: Batch, closed: bool = True) -> None:
@@ -295,26 +297,31 @@ class Rollouts(ABC):
         width = 1 if len(y) == 1 else self.lanes
         self.call("map", width, entries, kinds, len(kinds), steps, len(steps), y, len(y), out)
 
+    def single_steps(self, entries: np.ndarray, kinds: np.ndarray, y: np.ndarray) -> Steps:
+        """One step from every row of `y` (N, 2d) by columns of its own: (N, m, size), of these kinds (m,)."""
+        nothing = np.zeros((len(y), 2, self.size))
+        columns = np.concatenate([entries, nothing], axis=1), np.append(kinds, [0, 0])
+        rollout, task = partial(self.run, columns, closed=False), Task(0.0, y, 1, ONE)
+        start = np.column_stack([y, np.arange(len(y), dtype=float)])
+        found = run_states(rollout, task, self.n_values, 0.0, start, self.counted)
+        return Steps(found.states[:, 0], found.iterations)
+
 
 class SplittingRollouts(Rollouts):
     """The compiled functions of splitting schemes, whose tables are the numbers of kicks and drifts."""
 
-    @abstractmethod
     def step_rows(
-        self, table: Any, x: np.ndarray, h: np.ndarray, t: np.ndarray, y: np.ndarray, out: np.ndarray
+        self, table: np.ndarray, x: np.ndarray, h: np.ndarray, t: np.ndarray, y: np.ndarray, out: np.ndarray
     ) -> None:
         """One step of length ``h[i]`` at ``t[i]`` from every row of `y`, by polynomials of ``x[i]``, into `out`."""
+        powers = POWERS[: len(table), None, None]
+        out[:] = self.own_steps((evaluated(table, x) * h**powers).reshape(len(table), -1), y)
 
     def own_steps(self, table: np.ndarray, y: np.ndarray) -> np.ndarray:
         """One step from every row of `y` (N, 2d) by its own numbers: a table (n, m N), a column of all rows each."""
         n = len(y)
         entries, kinds = self.columns(table)
-        entries = entries.reshape(-1, n, self.size).swapaxes(0, 1)
-        nothing = np.zeros((n, 2, self.size))
-        columns = np.concatenate([entries, nothing], axis=1), np.append(kinds[::n], [0, 0])
-        batch = Batch.whole(np.column_stack([y, np.arange(n, dtype=float)]), 1, ONE, self.n_out)
-        self.run(columns, batch, False)
-        return batch.out[:, 0]
+        return self.single_steps(entries.reshape(-1, n, self.size).swapaxes(0, 1), kinds[::n], y).states
 
     def columns(self, table: np.ndarray) -> Columns:
         """The columns of a table of numbers."""

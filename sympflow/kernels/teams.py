@@ -18,7 +18,6 @@ from sympflow.compiler.control import INT, Code, Type, Value
 from sympflow.compiler.machine import address, given
 from sympflow.kernels.rollouts import Columns, SplittingRollouts
 from sympflow.kernels.runs import BLOCK, Memory, Room
-from sympflow.kernels.stages import evaluated
 from sympflow.kernels.threads import NEVER, threads_for
 
 __all__ = ["Member", "SharedMemory", "SharedRollouts", "meet"]
@@ -138,7 +137,7 @@ class SharedRollouts(SplittingRollouts):
             kinds[table[k] != 0] = k
         return np.ascontiguousarray(table.T), kinds
 
-    def call(self, name: str, width: int, *arguments: Any, n_out: int | None = None) -> None:
+    def call(self, name: str, width: int, *arguments: Any) -> None:
         """Call a compiled run or map; one state is shared by several threads where that pays."""
         if name == "run":
             n_rows, n_columns = arguments[5], arguments[2] * (arguments[7] - arguments[6])
@@ -159,13 +158,6 @@ class SharedRollouts(SplittingRollouts):
             function(*shared, len(own.room) // 3, self.n_out, address(own.room), address(own.context))
 
         together(threads, run, stop)
-
-    def step_rows(
-        self, table: np.ndarray, x: np.ndarray, h: np.ndarray, t: np.ndarray, y: np.ndarray, out: np.ndarray
-    ) -> None:
-        """One step of length ``h[i]`` from every row of `y`, by numbers that are polynomials of ``x[i]``."""
-        powers = np.array([1, 1, 3, 5])[: len(table)]
-        out[:] = self.own_steps((evaluated(table, x) * h ** powers[:, None, None]).reshape(len(table), -1), y)
 
     def own_steps(self, table: np.ndarray, y: np.ndarray) -> np.ndarray:
         out, tables = np.empty_like(y), table.reshape(len(table), -1, len(y))

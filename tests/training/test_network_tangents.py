@@ -10,7 +10,7 @@ from sympflow import HamiltonianSystem, MLPFlow, SympFlow, systems, train
 from sympflow.flow.layers import Kick
 from sympflow.flow.potentials import ACTIVATIONS, MLPPotential, Potential
 from sympflow.flow.scaling import Scaling
-from sympflow.kernels.activations import SLOPES, bent
+from sympflow.kernels.activations import SIGMAS, bent
 from sympflow.training.least_squares import gram
 from sympflow.training.losses import Loss, Objective
 from sympflow.training.points import Points
@@ -65,7 +65,7 @@ def test_two_losses_at_once():
     torch.testing.assert_close(2 * J.T @ r, torch.cat([w.reshape(-1) for w in g]), rtol=1e-10, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", SLOPES)
+@pytest.mark.parametrize("name", SIGMAS)
 def test_three_derivatives_of_activations(name):
     a = torch.linspace(-30, 30, 121, dtype=torch.float64, requires_grad=True)
     value = ACTIVATIONS[name].value(a)
