@@ -45,10 +45,10 @@ def host() -> Host:
     return Host(llvm.get_host_cpu_name(), has.flatten(), bool(has.get("fma")) or arm, wide)
 
 
-def _target(level: int = 2) -> Any:
+def _target() -> Any:
     machine = host()
     target = llvm.Target.from_default_triple()
-    return target.create_target_machine(cpu=machine.cpu, features=machine.features, opt=level)
+    return target.create_target_machine(cpu=machine.cpu, features=machine.features, opt=2)
 
 
 _LOCK = threading.RLock()

@@ -665,12 +665,11 @@ class KeplerKernel(Kernel):
         parts = self.loops.parts(self.form, threads)
         running = np.zeros((1, self.code.n_values)) if carry is None or carry.running is None else carry.running
         running = running.reshape(1, -1)
-        batches = []
+        first, batches = 0 if carry is None else carry.steps, []
         for code, places in parts:
-            own = Batch.whole(task.y0[:, places[: code.whole]], task.n_steps, save, code.n_out)
-            if carry is not None:
-                own = own._replace(first=carry.steps, running=running[:, places])
-            batches.append(own)
+            start, ended = task.y0[:, places[: code.whole]], np.empty(1, dtype=np.int64)
+            out, kept = np.empty((1, len(save), code.n_out)), running[:, places if carry is not None else []]
+            batches.append(Batch(start, task.n_steps, save, out, ended, first, kept))
 
         def run(code: KeplerCode, own: Batch, stop: np.ndarray) -> None:
             self.rollout(code, task.h)(own._replace(stop=stop))
@@ -681,11 +680,11 @@ class KeplerKernel(Kernel):
             rows[..., places[: code.whole]] = own.out
             if carry is not None:
                 new[:, places] = own.running
-        ended = [int(own.n_finite[0]) for own in batches]
-        rows[:, save > min(ended)] = np.nan
+        steps = [int(own.n_finite[0]) for own in batches]
+        rows[:, save > min(steps)] = np.nan
         if carry is not None:
             carry.advance(task.n_steps, new)
-        return rows, np.array([min(ended)]), parts[int(np.argmin(ended))][0]
+        return rows, np.array([min(steps)]), parts[int(np.argmin(steps))][0]
 
     def _pair(self, code: KeplerCode) -> str:
         """A sentence on the bodies that met."""

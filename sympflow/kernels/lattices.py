@@ -18,7 +18,6 @@ from typing import Any
 
 import numpy as np
 
-from sympflow.compiler import arrays_only
 from sympflow.compiler.arrange import ALWAYS, Arrangement
 from sympflow.compiler.control import INT, Sweep, Type, Value
 from sympflow.compiler.functions import FUNCTIONS, added, is_zero, times
@@ -30,7 +29,7 @@ from sympflow.hamiltonian.monomials import Monomials
 from sympflow.kernels.rollouts import aligned, zeros
 from sympflow.kernels.runs import Numbers, Room
 from sympflow.kernels.teams import Member, SharedMemory, SharedRollouts, meet
-from sympflow.schemes import CURVATURE, POLYNOMIAL
+from sympflow.schemes import CURVATURE
 
 __all__ = ["LatticeCode"]
 
@@ -899,8 +898,6 @@ class LatticeCode(SharedRollouts):
     def __init__(
         self, lattice: LatticeHamiltonian, damped: bool, level: int, compensated: bool, monomials: Monomials = ()
     ) -> None:
-        if level == POLYNOMIAL:
-            raise arrays_only("`scheme` has polynomials, which are of systems by their coordinates one by one")
         super().__init__(2 * lattice.ndof * (1 + compensated), 2 * lattice.ndof)
         self._given = lattice, damped, level, compensated
         self._order, width = arrangement(lattice)

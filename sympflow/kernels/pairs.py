@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import sympy as sp
 
-from sympflow.compiler import NotCompiled
 from sympflow.compiler.arrange import Arranged, Arrangement
 from sympflow.compiler.control import INT, POINTER, Code, Type, Value
 from sympflow.compiler.functions import apply, fma, summed
@@ -29,9 +28,9 @@ from sympflow.kernels.array_splittings import ARRAYS, ArrayCode, Forces, Functio
 from sympflow.kernels.cells import MOST_RANGES, Cells, most_along, most_cells
 from sympflow.kernels.rollouts import aligned, zeros
 from sympflow.kernels.runs import Numbers, Room, Values, begun, finished
-from sympflow.kernels.splittings import Shape, Splitting, Stage, WithinRange
+from sympflow.kernels.splittings import Shape, Splitting, Stage
 from sympflow.kernels.teams import Member, SharedMemory, SharedRollouts, meet
-from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL
+from sympflow.schemes import CURVATURE, FORCE_GRADIENT
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.monomials import Monomials
@@ -166,10 +165,6 @@ class FewSplitting(Splitting):
         local = self.symbols.local
         pair = local.V, local.first, local.c, local.cutoff is None, local.box is None
         return *pair, local.n_bodies, local.dim, self.level, self.compensated, self.friction
-
-    def kinds(self) -> Sequence[Stage | WithinRange]:
-        _check_level(self.level)
-        return super().kinds()
 
     def _arranged(self, terms: int) -> Stage:
         return FewShape(self, terms, True).arranged()[1]
@@ -446,18 +441,12 @@ class PairSums(Forces):
                 code.store(code.load(F, at) + code.total(variable.value), F, at)
 
 
-def _check_level(level: int) -> None:
-    if level == POLYNOMIAL:
-        raise NotCompiled("`scheme` has polynomials, which need a symbolic system: take one without them.")
-
-
 class PairCode(SharedRollouts):
     """The compiled functions of schemes on bodies, `damped` by −γp: the potential alone is part of the code."""
 
     def __init__(
         self, local: PairsHamiltonian, damped: bool, level: int, compensated: bool, monomials: Monomials = ()
     ) -> None:
-        _check_level(level)
         self._given = local, damped, level, compensated
         self._local = local
         self._stages = PairSums(local, level, compensated, damped)

@@ -82,12 +82,6 @@ class Batch(NamedTuple):
     stop: np.ndarray = NEVER
     kept: np.ndarray | None = None
 
-    @classmethod
-    def whole(cls, y0: np.ndarray, n_steps: int, save: np.ndarray, n_out: int) -> Batch:
-        """A run from its beginning, whose end is not kept."""
-        out, n_finite = np.empty((len(y0), len(save), n_out)), np.empty(len(y0), dtype=np.int64)
-        return cls(y0, n_steps, save, out, n_finite, 0, np.empty((len(y0), 0)))
-
     def rows(self, begin: int, end: int, stop: np.ndarray | None = None) -> Batch:
         """Some of the rows, and what stops them."""
         stop = self.stop if stop is None else stop

@@ -366,6 +366,11 @@ class Room:
         self.code, self.width, self.state, self.work, self.size, self.places = code, width, state, work, size, data
         self.type = Type("double", width)
 
+    @property
+    def rows(self) -> Rows:
+        """The numbers of the state."""
+        return Rows(self.state, self.type)
+
     def data(self, i: int) -> Value:
         """The address of array i of those that a stage reads."""
         return self.code.load(self.places, i, POINTER)

@@ -20,7 +20,7 @@ from sympflow.kernels.protocol import Kernel, Run, Steps, Task, run_states
 from sympflow.kernels.stages import StageTable, check_damping, run_table, step_table
 from sympflow.kernels.threads import given
 from sympflow.lazy import kept
-from sympflow.schemes import CURVATURE, FORCE_GRADIENT, Scheme
+from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL, Scheme
 
 if TYPE_CHECKING:
     from sympflow.kernels.approximations import Ranges
@@ -149,7 +149,8 @@ class SplittingLoops:
                 "or define it with HamiltonianSystem.from_sympy, or use backend='array'."
             )
         self._system: ref[HamiltonianSystem] | None = ref(system)  # which keeps these loops
-        self._has_curvature = system.form is not None or system.local is not None
+        others = FORCE_GRADIENT if system.local is None else CURVATURE
+        self._highest = others if system.form is None else POLYNOMIAL
         self._variants: dict[tuple[int, bool, Monomials, bool, Ranges | None], SplittingRollouts] = {}
 
     def __getstate__(self) -> dict[str, Any]:
@@ -181,7 +182,7 @@ class SplittingLoops:
                 "`scheme` has force gradients, which need a kinetic energy quadratic in p and, for a system of Numba "
                 "functions, `hessian_vector`: take a scheme without them, for instance 'kahan_li8'."
             )
-        if level > FORCE_GRADIENT and not self._has_curvature:
+        if level > self._highest:
             what = "curvature terms" if level == CURVATURE else "polynomials"
             raise NotCompiled(f"`scheme` has {what}, which need a symbolic system: take one without them.")
         made: SplittingRollouts

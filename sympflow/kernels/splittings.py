@@ -5,7 +5,7 @@ A kick is p − b∇V + g∇²V v − c∇(½ v·∇²V v) with v = M⁻¹∇V, 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cached_property
@@ -20,8 +20,8 @@ from sympflow.compiler.program import Program, Traced, adjoint, derivatives, gra
 from sympflow.hamiltonian.formulas import evaluator
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.kernels.rollouts import Columns, SplittingRollouts
-from sympflow.kernels.runs import Numbers, Room, step_function
-from sympflow.kernels.stages import kicks_of
+from sympflow.kernels.runs import Numbers, Room, Values, assign, step_function
+from sympflow.kernels.stages import Kick, kick_of
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT
 
 if TYPE_CHECKING:
@@ -116,8 +116,12 @@ class Splitting:
         return bool(V is not None and T is not None and V.is_polynomial(*symbols.q) and T.is_polynomial(*symbols.p))
 
     @property
+    def full_kick(self) -> Kick:
+        return kick_of(self.level, len(self.monomials))
+
+    @property
     def kick_numbers(self) -> tuple[str, ...]:
-        return kicks_of(self.level, len(self.monomials))[0].numbers
+        return self.full_kick.numbers
 
     @property
     def numbers(self) -> list[str]:
@@ -403,27 +407,25 @@ class SplittingCode(SplittingRollouts):
     def stage(self, values: Any, numbers: Numbers, kind: Value, step: Value) -> Any:
         """A kick and a drift, of the kind that a column has, of values or of a state in memory."""
         if isinstance(values, Room):
-            for k in range(len(self._kinds)):
-                with values.code.given(values.code.apply("eq", (kind, k))):
-                    self._executed(k, values, self._column(k, values.type, numbers, step))
+            for k in self._given_kind(kind):
+                self._executed(k, values, self._column(k, values.type, numbers, step))
             return None
-        if len(self._kinds) == 1:
-            return self._executed(0, values, self._column(0, values[0].type, numbers, step))
-        code = values[0].code
-        results = [code.variable(x) for x in values]
-        for k in range(len(self._kinds)):
-            with code.given(code.apply("eq", (kind, k))):
-                column = self._column(k, values[0].type, numbers, step)
-                for result, x in zip(results, self._executed(k, values, column), strict=True):
-                    result.value = x
+        results = [step.code.variable(x) for x in values]
+        for k in self._given_kind(kind):
+            assign(results, self._executed(k, values, self._column(k, values[0].type, numbers, step)))
         return [x.value for x in results]
 
-    def over(self, each: Callable[..., None], numbers: Numbers, kind: Value, step: Value) -> None:
-        code, type = step.code, numbers(0).type
+    def _given_kind(self, kind: Value) -> Iterator[int]:
+        """Each kind of stage: what is written for it is executed for columns of this kind."""
         for k in range(len(self._kinds)):
-            with code.given(code.apply("eq", (kind, k))):
-                column = self._column(k, type, numbers, step)
-                each(lambda values, k=k, column=column: self._executed(k, values, column))
+            with kind.code.given(kind.code.apply("eq", (kind, k))) if len(self._kinds) > 1 else nullcontext():
+                yield k
+
+    def over(self, each: Callable[..., None], numbers: Numbers, kind: Value, step: Value) -> None:
+        type = numbers(0).type
+        for k in self._given_kind(kind):
+            column = self._column(k, type, numbers, step)
+            each(lambda values, k=k, column=column: self._executed(k, values, column))
 
     def _executed(self, k: int, values: Any, column: Sequence[Value]) -> Any:
         return self._kinds[k].body(*values, *column)
@@ -467,17 +469,35 @@ class SplittingCode(SplittingRollouts):
 
     def check_reverse(self) -> None:
         """All stages have a reverse."""
+        if not all(isinstance(kind, Stage) for kind in self._kinds) or self._splitting.symbols.samples:
+            super().check_reverse()
+        self._adjoints  # noqa: B018
+
+    def adjoint(
+        self, values: Values, cotangents: Values, numbers: Numbers, kind: Value, step: Value, slopes: bool, *room: Room
+    ) -> tuple[Values, Values]:
+        code, type = step.code, values[0].type
+        zero = code.constant(0.0, type)
+        found: list[Variable] = [code.variable(zero) for _ in range(self.n_values + self.size)]
+        for k in self._given_kind(kind):
+            program = self._adjoints[k]
+            n = len(program.inputs) - 2 * self.n_values - self.timed
+            column = [numbers(i, lone=True) for i in range(n)]
+            if self.timed:
+                column.append(self._time(column, step))
+            results = [code.operand(x, type) for x in program(*values, *column, *cotangents)]
+            assign(found[: len(results)], results)
+        return [x.value for x in found[: self.n_values]], [x.value for x in found[self.n_values :]]
 
     def of_values(self, given: Sequence[Value], cotangents: Sequence[Value], kind: Value) -> list[Value]:
         if self.timed:
             return [*cotangents[self.size - self.own :]]
         code, type = kind.code, cotangents[0].type
         found = [code.variable(code.constant(0.0, type)) for _ in range(self.own)]
-        for k, program in enumerate(self._of_tables):
-            n = len(program.inputs) - len(given)
-            with code.given(code.apply("eq", (kind, k))) if len(self._of_tables) > 1 else nullcontext():
-                for result, x in zip(found, program(*given, *cotangents[:n]), strict=True):
-                    result.value = code.operand(x, type)
+        for k in self._given_kind(kind):
+            program = self._of_tables[k]
+            of_values = program(*given, *cotangents[: len(program.inputs) - len(given)])
+            assign(found, [code.operand(x, type) for x in of_values])
         return [x.value for x in found]
 
     @cached_property
@@ -491,8 +511,7 @@ class SplittingCode(SplittingRollouts):
         import torch
 
         state = [*y.unbind(-1), *[torch.zeros_like(y[..., 0])] * (self.n_values - self.n_out)]
-        kick, kinds = kicks_of(self._splitting.level, len(self._splitting.monomials))[0], self._kinds_of(numbers)
-        powers = [1, *kick.powers]
+        kinds, powers = self._kinds_of(numbers), [1, *self._splitting.full_kick.powers]
         for k, column in zip(kinds, numbers.T.tolist(), strict=True):
             given = [c * h**power for c, power in zip(column, powers, strict=False)]
             if self.timed:
@@ -509,8 +528,7 @@ class SplittingCode(SplittingRollouts):
         what, _, own = name.partition(" ")
         if what != "step":
             return super().made(name, width)
-        kick = kicks_of(self._splitting.level, len(self._splitting.monomials))[0]
-        powers = [1, *kick.powers, *((1, 0, 0) if self.timed else ()), *[0] * self.own]
+        powers = [1, *self._splitting.full_kick.powers, *((1, 0, 0) if self.timed else ()), *[0] * self.own]
         last, table = len(self._kinds) - 1, self._kinds[-1].table
 
         def column(time: Value, *given: Value) -> list[Any]:

@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sympflow.compiler import NotCompiled
-from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL, Scheme
+from sympflow.schemes import POLYNOMIAL, Scheme
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.friction import Friction
     from sympflow.hamiltonian.system import HamiltonianSystem
 
-__all__ = ["StageTable", "check_damping", "kicks_of", "run_table", "single_table", "step_table", "with_last_stage"]
+__all__ = ["StageTable", "check_damping", "kick_of", "run_table", "single_table", "step_table", "with_last_stage"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,7 +165,7 @@ def with_last_stage(run: StageTable, after: StageTable) -> StageTable:
     return replace(after, numbers=numbers, times=np.concatenate([run.times[-1:], after.kick_times[merged:]]))
 
 
-# kinds of kick --------------------------------------------------------------------------------------------
+# kicks --------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -176,16 +176,11 @@ class Kick:
     powers: tuple[int, ...]
 
 
-PLAIN, GRADIENT, CURVED = Kick(("b",), (1,)), Kick(("b", "g"), (1, 3)), Kick(("b", "g", "c"), (1, 3, 5))
-KICKS = {0: (PLAIN,), FORCE_GRADIENT: (GRADIENT, PLAIN), CURVATURE: (CURVED, GRADIENT, PLAIN)}
-"""The kinds of kick of a level, that with most numbers first."""
-
-
-def kicks_of(level: int, n_monomials: int = 0) -> tuple[Kick, ...]:
-    """The kinds of kick of a level, that with most numbers first; a polynomial of n monomials stands alone."""
-    if level != POLYNOMIAL:
-        return KICKS[level]
-    return (Kick(("b", *(f"e_{m}" for m in range(n_monomials))), (1,) + (3,) * n_monomials),)
+def kick_of(level: int, n_monomials: int = 0) -> Kick:
+    """The kick of a level with all its terms, of a polynomial with n monomials."""
+    if level == POLYNOMIAL:
+        return Kick(("b", *(f"e_{m}" for m in range(n_monomials))), (1,) + (3,) * n_monomials)
+    return Kick(("b", "g", "c")[: 1 + level], (1, 3, 5)[: 1 + level])
 
 
 MOST_COUPLED = 6

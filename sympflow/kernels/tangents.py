@@ -6,7 +6,7 @@ k(q), w_p' = w_p + ∇k w_q, and likewise of a drift. Vectors are scaled by powe
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property, partial
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -133,51 +133,37 @@ class TangentCode(SplittingCode):
         return [Linearised(self._splitting, terms, True).linearised() for terms in self._splitting.terms]
 
     def _executed(self, kind: int, values: Any, column: Sequence[Value]) -> Any:
-        d, body = self._d, self._kinds[kind].body
-        if not isinstance(values, Room):
-            found = body(*values[: 2 * d], *column)
-            moved = found[: 2 * d]
-            for k in range(1, 1 + self.vectors):
-                w = values[2 * d * k :][: 2 * d]
-                q, p = _vector_moved(d, found[2 * d :], w[:d], w[d:])
-                moved += [*q, *p]
-            return [*moved, *values[len(moved) :]]
-        room = values
-        found = body(*(room.load(i) for i in range(2 * d)), *column)
-        for m, x in enumerate(found[: 2 * d]):
-            room.store(x, m)
-        with room.code.over(self._count(room)) as i:
-            place = room.part((i + 1) * (2 * d))
-            w = [room.load(m, place) for m in range(2 * d)]
-            q, p = _vector_moved(d, found[2 * d :], w[:d], w[d:])
-            for m, x in enumerate([*q, *p]):
-                room.store(x, m, place)
-        return None
+        d, width = self._d, 2 * self._d
+        x = values.rows if isinstance(values, Room) else [*values]
+        found = self._kinds[kind].body(*(x[m] for m in range(width)), *column)
+        for m in range(width):
+            x[m] = found[m]
+        for i, _ in self._vectors(values):
+            w = [x[i + m] for m in range(width)]
+            q, p = _vector_moved(d, found[width:], w[:d], w[d:])
+            for m, y in enumerate([*q, *p]):
+                x[i + m] = y
+        return x
 
-    def _count(self, room: Room) -> Value:
-        each = 2 * self._d + self._grows
-        return room.code.op("sdiv", INT, room.size - 2 * self._d, room.code.constant(each, INT))
+    def _vectors(self, values: Any) -> Iterator[tuple[Any, Any]]:
+        """The places of each vector and of its exponent, in a loop where the state is in memory."""
+        width = 2 * self._d
+        if not isinstance(values, Room):
+            yield from ((k * width, (self.vectors + 1) * width + k - 1) for k in range(1, 1 + self.vectors))
+            return
+        code = values.code
+        count = code.op("sdiv", INT, values.size - width, code.constant(width + self._grows, INT))
+        with code.over(count) as i:
+            yield (i + 1) * width, (count + 1) * width + i
 
     def look(self, values: Any) -> Any:
         """Divide vectors by the power of two next to their lengths, whose exponents are added up."""
-        d, k = self._d, self.vectors
-        if isinstance(values, Room):
-            return self._look_at(values)
-        state, exponents = values[:-k], []
-        for i in range(1, 1 + k):
-            w = slice(2 * d * i, 2 * d * (i + 1))
-            state[w], exponent = _rescaled(state[w], values[i - 1 - k])
-            exponents.append(exponent)
-        return [*state, *exponents]
-
-    def _look_at(self, room: Room) -> None:
-        width, count = 2 * self._d, self._count(room)
-        with room.code.over(count) as i:
-            place, last = room.part((i + 1) * width), (count + 1) * width + i
-            w, exponent = _rescaled([room.load(m, place) for m in range(width)], room.load(last))
-            for m, x in enumerate(w):
-                room.store(x, m, place)
-            room.store(exponent, last)
+        x = values.rows if isinstance(values, Room) else [*values]
+        for i, last in self._vectors(values):
+            w, x[last] = _rescaled([x[i + m] for m in range(2 * self._d)], x[last])
+            for m, y in enumerate(w):
+                x[i + m] = y
+        return x
 
 
 def _rescaled(w: Sequence[Value], exponent: Value) -> tuple[list[Value], Value]:
