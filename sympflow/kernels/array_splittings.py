@@ -38,22 +38,22 @@ class Forces(ABC):
         self._mass = inverse_mass
 
     @abstractmethod
-    def sum(self, order: int, room: Room, given: Sequence[Value], out: Value, d: Value, letters: Sequence[Any]) -> None:
+    def sum(self, order: int, room: Room, given: Sequence[Rows], out: Rows, d: Value, letters: Sequence[Any]) -> None:
         """∇V(q), ∇²V(q) v and ½ ∇³V(q)(v, v) of places q and v in memory, by the order 0, 1, 2, into another one."""
 
-    def velocity(self, room: Room, p: Value, out: Value, d: Value, letters: Sequence[Any]) -> None:
+    def velocity(self, room: Room, p: Rows, out: Rows, d: Value, letters: Sequence[Any]) -> None:
         """∇T(p)."""
         code, M = room.code, self._mass
         masses = None if M is None else room.data(len(self.data) - 1)
         with code.over(d) as i:
             if masses is None or M is None:
-                room.store(room.load(i, p), i, out)
+                out[i] = p[i]
             elif M.ndim == 1:
-                room.store(room.load(i, p) * code.load(masses, i), i, out)
+                out[i] = p[i] * code.load(masses, i)
             else:
-                room.store(0.0, i, out)
+                out[i] = 0.0
                 with code.over(d) as j:
-                    room.add(code.load(masses, i * d + j) * room.load(j, p), i, out)
+                    out[i] = out[i] + code.load(masses, i * d + j) * p[j]
 
 
 class TermForces(Forces):
@@ -66,24 +66,23 @@ class TermForces(Forces):
         self._V, self._T = V, T
         self.data = [*V.data, *([] if T is None else [T] if isinstance(T, np.ndarray) else T.data)]
 
-    def sum(self, order: int, room: Room, given: Sequence[Value], out: Value, d: Value, letters: Sequence[Any]) -> None:
+    def sum(self, order: int, room: Room, given: Sequence[Rows], out: Rows, d: Value, letters: Sequence[Any]) -> None:
         self._add(self._V, 0, order, room, given, out, d, letters)
 
-    def velocity(self, room: Room, p: Value, out: Value, d: Value, letters: Sequence[Any]) -> None:
+    def velocity(self, room: Room, p: Rows, out: Rows, d: Value, letters: Sequence[Any]) -> None:
         if self._T is None or isinstance(self._T, np.ndarray):
             super().velocity(room, p, out, d, letters)
         else:
             self._add(self._T, len(self._V.data), 0, room, [p], out, d, letters)
 
     def _add(
-        self, terms: Terms, first: int, order: int, room: Room, given: Any, out: Value, d: Value, letters: Sequence[Any]
+        self, terms: Terms, first: int, order: int, room: Room, given: Any, out: Rows, d: Value, letters: Sequence[Any]
     ) -> None:
         """Write derivatives of terms, whose arrays are those from the `first` on, into another place in memory."""
         with room.code.over(d) as i:
-            room.store(0.0, i, out)
+            out[i] = 0.0
         data = [room.data(first + k) for k in range(len(terms.data))]
-        rows, total = [Rows(x, room.type) for x in given], Rows(out, room.type)
-        terms.add(data, terms.derivatives(order), rows, letters, lambda places: [(total, i) for i in places])
+        terms.add(data, terms.derivatives(order), given, letters, lambda places: [(out, i) for i in places])
 
 
 class Functions(Forces):
@@ -103,13 +102,13 @@ class Functions(Forces):
     def __reduce__(self) -> tuple[Any, ...]:
         return Functions, self._given
 
-    def sum(self, order: int, room: Room, given: Sequence[Value], out: Value, d: Value, letters: Sequence[Any]) -> None:
+    def sum(self, order: int, room: Room, given: Sequence[Rows], out: Rows, d: Value, letters: Sequence[Any]) -> None:
         code = room.code
         with code.over(d) as i:
-            room.store(float("nan"), i, out)  # what a function does not write ends the run
+            out[i] = float("nan")  # what a function does not write ends the run
         address = code.load(room.data(0), order, POINTER)
         time = letters[0] if letters else code.constant(0.0)
-        code.call(address.name, [time, given[0], given[-1], out, d])
+        code.call(address.name, [time, given[0].place, given[-1].place, out.place, d])
 
 
 def term_code(splitting: Splitting) -> ArrayCode:
@@ -212,8 +211,8 @@ class ArrayCode(SplittingCode):
         splitting, code, forces = self._splitting, room.code, self._forces
         d, kicks = self._ndof(room), given[1 : 1 + len(splitting.kick_numbers)]
         letters = self._letters(given)
-        q, p = room.state, room.part(d)
-        slope, velocity, product, bent = (room.part(d * i, room.work) for i in range(ARRAYS))
+        q, p = room, room.part(d)
+        slope, velocity, product, bent = (room.work.part(d * i) for i in range(ARRAYS))
         forces.sum(0, room, [q], slope, d, letters)
         factors = [(-kicks[0], slope)]
         if terms > 1:
@@ -223,9 +222,9 @@ class ArrayCode(SplittingCode):
         if terms > 2:
             forces.sum(2, room, [q, velocity], bent, d, letters)
             with code.over(d) as i:
-                bend = kicks[2] * room.load(i, bent)
-                change = fma(kicks[1], room.load(i, product), -(kicks[0] * room.load(i, slope)))
-                room.store(change - bend, i, slope)
+                bend = kicks[2] * bent[i]
+                change = fma(kicks[1], product[i], -(kicks[0] * slope[i]))
+                slope[i] = change - bend
             forces.velocity(room, product, velocity, d, letters)
             forces.sum(1, room, [q, velocity], product, d, letters)
             factors = [(1.0, slope), (-kicks[2], product)]
@@ -233,10 +232,10 @@ class ArrayCode(SplittingCode):
             self._store_polynomial(room, velocity, kicks)
             factors.append((-1.0, velocity))
         with code.over(d) as i:
-            changes = [(factor, room.load(i, place)) for factor, place in factors]
+            changes = [(factor, vector[i]) for factor, vector in factors]
             self._move(room, p, i, changes, 3)
 
-    def _store_polynomial(self, room: Room, out: Value, kicks: Sequence[Any]) -> None:
+    def _store_polynomial(self, room: Room, out: Rows, kicks: Sequence[Any]) -> None:
         """Σ e ∇q^m."""
         splitting, d = self._splitting, self._splitting.ndof
 
@@ -250,28 +249,26 @@ class ArrayCode(SplittingCode):
             return gradient(total, numbers[:d])
 
         names = [*(s.name for s in splitting.symbols.q), *splitting.kick_numbers[1:]]
-        for i, x in enumerate(traced(slopes, *names)(*(room.load(i) for i in range(d)), *kicks[1:])):
-            room.store(x, i, out)
+        for i, x in enumerate(traced(slopes, *names)(*(room[i] for i in range(d)), *kicks[1:])):
+            out[i] = x
 
     def drifted(self, room: Room, given: Sequence[Any]) -> None:
         """Write a drift."""
         splitting, code, forces = self._splitting, room.code, self._forces
         d, a = self._ndof(room), given[0]
-        q, p = room.state, room.part(d)
-        spread, velocity = (room.part(d * i, room.work) for i in range(2))
-        moved = p
+        q, p = room, room.part(d)
+        spread, velocity = (room.work.part(d * i) for i in range(2))
+        moved: Rows = p
         if splitting.friction is not None:
             n = splitting.ndof**splitting.friction
             first = 1 + len(splitting.kick_numbers)
             mean, decay = given[first : first + n], given[first + n : first + 2 * n]
             for i, k in self._each(room, d, n):
-                x = room.load(i, p)
-                room.store(mean[k] * x, i, spread)
-                room.store(decay[k] * x, i, p)
+                spread[i], p[i] = mean[k] * p[i], decay[k] * p[i]
             moved, a = spread, 1.0
         forces.velocity(room, moved, velocity, d, self._letters(given))
         with code.over(d) as i:
-            self._move(room, q, i, [(a, room.load(i, velocity))], 2)
+            self._move(room, q, i, [(a, velocity[i])], 2)
 
     def _each(self, room: Room, d: Value, n: int) -> Iterator[tuple[Any, int]]:
         """Each degree of freedom with the place of its rate; a loop where there is one rate."""
@@ -281,21 +278,19 @@ class ArrayCode(SplittingCode):
         with room.code.over(d) as i:
             yield i, 0
 
-    def _move(self, room: Room, x: Value, i: Value, changes: Sequence[tuple[Any, Value]], errors: int) -> None:
+    def _move(self, room: Room, x: Rows, i: Value, changes: Sequence[tuple[Any, Value]], errors: int) -> None:
         """Number i of x and Σ factor·change; by Kahan's compensated sum where there are errors, d numbers each."""
-        total, old = room.load(i, x), room.load(i, x)
+        total = old = x[i]
         if not self._splitting.compensated:
             for factor, change in changes:
                 total = fma(factor, change, total)
-            room.store(total, i, x)
+            x[i] = total
             return
-        place = room.part(self._ndof(room) * errors)
-        corrected = -room.load(i, place)
+        left = room.part(self._ndof(room) * errors)
+        corrected = -left[i]
         for factor, change in changes:
             corrected = fma(factor, change, corrected)
-        total, error = added(old, corrected)
-        room.store(error, i, place)
-        room.store(total, i, x)
+        x[i], left[i] = added(old, corrected)
 
     def _letters(self, given: Sequence[Any]) -> Sequence[Any]:
         return given[len(given) - len(self._splitting.parameters) :]

@@ -178,7 +178,6 @@ class _InMemory(_Explicit):
     """Steps in memory, of a large system."""
 
     lanes = 1
-    fewest = 1 << 62
 
     def __init__(self, field: Field, A: tuple[tuple[float, ...], ...], B: tuple[float, ...]) -> None:
         super().__init__(field, A, B)
@@ -188,20 +187,20 @@ class _InMemory(_Explicit):
     def stage(self, room: Room, numbers: Numbers, kind: Value, step: Value) -> None:  # type: ignore[override]
         code, n, s = room.code, self.n_out, len(self.B)
         column = self.column(code, numbers, step)
-        *K, Y, g, letters = (room.part(n * i, room.work) for i in range(s + 3))
+        *K, Y, g, letters = (room.work.part(n * i) for i in range(s + 3))
         data = [room.data(i) for i in range(len(self.data))]
         for i, row in enumerate(self.A):
             for k, x in enumerate([*column[1 : 1 + self.parameters], *self.letters_at(column, sum(row))]):
                 code.store(code.operand(x, DOUBLE), letters, k)
+                letters[k] = x
             self._move(room, Y, column[0], row, K)
-            code.outlined("field", [Y, K[i], g, letters, *data], self.field.fill, rare=False)
-        self._move(room, room.state, column[0], self.B, K)
+            places = [x.place for x in (Y, K[i], g, letters)]
+            code.outlined("field", [*places, *data], self.field.fill, rare=False)
+        self._move(room, room, column[0], self.B, K)
 
-    def _move(self, room: Room, to: Value, h: Value, weights: Sequence[float], K: Sequence[Value]) -> None:
-        code = room.code
-        with code.over(self.n_out) as m:
-            (x,) = _moved([room.load(m)], h, weights, [[code.load(k, m)] for k in K[: len(weights)]])
-            code.store(x, to, m)
+    def _move(self, room: Room, to: Rows, h: Value, weights: Sequence[float], K: Sequence[Rows]) -> None:
+        with room.code.over(self.n_out) as m:
+            (to[m],) = _moved([room[m]], h, weights, [[k[m]] for k in K[: len(weights)]])
 
 
 def _moved(y: Sequence[Any], h: Any, weights: Sequence[float], K: Sequence[Sequence[Any]]) -> list[Any]:

@@ -112,12 +112,12 @@ class KeplerCode(Rollouts):
 
     def stage(self, room: Room, numbers: Numbers, kind: Value, step: Value) -> None:  # type: ignore[override]
         """A kick and a drift, which may be of length 0."""
-        given = [room.state, room.work, room.places, *(numbers(i) for i in range(self.size))]
+        given = [room.place, room.work.place, room.places, *(numbers(i) for i in range(self.size))]
         room.code.outlined("stage", given, self._stage)
 
     def _stage(self, state: Value, work: Value, places: Value, *numbers: Value) -> None:
         code = state.code
-        room = Room(code, 1, state, work, code.constant(self.n_values, INT), places)
+        room = Room(state, 1, work, code.constant(self.n_values, INT), places)
         lengths = [code.splat(x, LANES) for x in numbers]
         table = room.data(0)
         known = [
@@ -143,7 +143,7 @@ class KeplerCode(Rollouts):
         """Move the planets, or in their place a deviation vector by the derivative of that, and return the kick."""
         code, groups = room.code, range(self.groups)
         (kick, drift, *third) = lengths
-        state = [self._read(room, code.at(room.state, NUMBERS * g), vector, NUMBERS * g) for g in groups]
+        state = [self._read(room, code.at(room.place, NUMBERS * g), vector, NUMBERS * g) for g in groups]
         if not self.jacobi:
             self._jump(room, state, c, 0.5 * kick, 1)
         x = [values(group[:AXES]) for group in state]
@@ -176,7 +176,7 @@ class KeplerCode(Rollouts):
             changes = drifted(x[g], v, c[g]["mu"], drift, roots[g], inverses[g])
             for y, change in zip(state[g], changes, strict=True):
                 y.add(change)
-            self._write(room, code.at(room.state, NUMBERS * g), state[g], vector, NUMBERS * g)
+            self._write(room, code.at(room.place, NUMBERS * g), state[g], vector, NUMBERS * g)
         return kick
 
     def _read(self, room: Room, place: Value, vector: Value | None = None, at: Any = 0) -> list[Sum]:
@@ -201,7 +201,7 @@ class KeplerCode(Rollouts):
     def _light(self, room: Room, g: Value, kick: Value, drift: Value, star: Value, vector: Value | None = None) -> None:
         """The same of a group of bodies without mass, which have the same planets inside their orbits."""
         code, light, at = room.code, len(self.light), (g + self.groups) * NUMBERS
-        place = code.at(room.state, at)
+        place = code.at(room.place, at)
         state = self._read(room, place, vector, at)
         x = values(state[:AXES])
         mu, over, inside = (code.splat(code.load(room.data(3), g + light * i), LANES) for i in range(3))
@@ -212,7 +212,7 @@ class KeplerCode(Rollouts):
             """One of the three vectors of a planet, in all lanes."""
             starts = [planets * (AXES * which + i) for i in range(AXES)]
             found, *rates = (
-                [code.splat(code.load(room.work, j + (start + more)), LANES) for start in starts]
+                [code.splat(code.load(room.work.place, j + (start + more)), LANES) for start in starts]
                 for more in ([0] if vector is None else [0, self.told])
             )
             return [Dual(y, z) for y, z in zip(found, *rates, strict=True)] if rates else found
@@ -330,7 +330,7 @@ class KeplerCode(Rollouts):
         """Write down one of three vectors of a group of planets, for the bodies without mass."""
         for i, value in enumerate(parts_of(vector)):
             start = self.told * (i // AXES) + LANES * (self.groups * (AXES * which + i % AXES) + g)
-            room.code.store(value, room.work, start)
+            room.code.store(value, room.work.place, start)
 
     def _heliocentric(self, x: list[Vectors], c: list[dict[str, Value]]) -> list[Vectors]:
         """Places as seen from the star, of those from the centre of all inside."""
@@ -362,7 +362,7 @@ class KeplerCode(Rollouts):
         """Divide vectors by the power of two next to their lengths, whose exponents are added up."""
         code, count = room.code, self.form.vectors
         with code.over(count) as k:
-            vector, last = code.at(room.state, (k + 1) * self.whole), (count + 1) * self.whole + k
+            vector, last = code.at(room.place, (k + 1) * self.whole), (count + 1) * self.whole + k
             registers = self.whole // LANES
 
             def grown(i: Value, total: list[Value]) -> list[Value]:
@@ -372,7 +372,7 @@ class KeplerCode(Rollouts):
             n, factor = exponent_of(code.total(size))
             with code.over(registers) as i:
                 code.store(code.load(vector, LANES * i, REGISTER) * code.splat(factor, LANES), vector, LANES * i)
-            code.store(code.load(room.state, last) + n, room.state, last)
+            code.store(code.load(room.place, last) + n, room.place, last)
 
     def _met(self, room: Room, met: Value, h: list[Vectors], like: Value, light: Value | None = None) -> Value:
         """NaN where two planets met, whose places are then written down; else 0."""
@@ -384,7 +384,7 @@ class KeplerCode(Rollouts):
             places = [y for group in h for y in group]
             if light is not None:
                 turns = [(g, i) for g in range(self.groups) for i in range(AXES)]
-                planets = [code.load(room.work, LANES * (self.groups * i + g), like.type) for g, i in turns]
+                planets = [code.load(room.work.place, LANES * (self.groups * i + g), like.type) for g, i in turns]
                 places = [*planets, *places]
             for i, value in enumerate(places):
                 code.store(value, room.data(2), LANES * i)

@@ -377,9 +377,9 @@ class LatticeStages:
         """Change a state by a kick of a kind, without force gradient up to 1, and a drift."""
         given = [numbers(i) for i in range(len(self.form.column))]
         if self._operations < INLINE:
-            self._stage(room.state, room.places, kind, *given)
+            self._stage(room.place, room.places, kind, *given)
         else:
-            room.code.outlined("stage", (room.state, room.places, kind, *given), self._stage)
+            room.code.outlined("stage", (room.place, room.places, kind, *given), self._stage)
 
     def _stage(self, state: Value, context: Value, kind: Value, *numbers: Value) -> None:
         code, scene = state.code, _Scene(self, state, context, numbers)
@@ -401,7 +401,7 @@ class LatticeInMemory(SharedMemory):
 
     def finite(self) -> Value:
         """True where the pieces of all threads are finite."""
-        scene, code = _Scene(self._stages, self._end.state, self._context), self.code
+        scene, code = _Scene(self._stages, self._end.place, self._context), self.code
         good = code.variable(super().finite())
         with code.given(scene.number("members") > 1):
             found = scene.address("found")
@@ -414,7 +414,7 @@ class LatticeInMemory(SharedMemory):
 
     def copied(self, room: Room, rows: Value, row: Value, sets: int, loads: bool) -> None:
         n = sets * self._stages.fields
-        scene, code, width = _Scene(self._stages, room.state, self._context), self.code, self._stages.form.width
+        scene, code, width = _Scene(self._stages, room.place, self._context), self.code, self._stages.form.width
         at, starts, sizes = scene.numbers, scene.address("starts"), scene.address("sizes")
         rows = code.at(rows, row * (at["sites"] * n))
         for v, key in enumerate(self._stages.vectors[:n]):

@@ -167,7 +167,7 @@ class _NetworkRollouts(Rollouts):
         code, layout = room.code, self._layout
         kick = code.apply("eq", (kind & 1, 1))
         q, p = code.constant(0, INT), code.constant(layout.ndof, INT)
-        x, target = room.part(code.select(kick, q, p)), room.part(code.select(kick, p, q))
+        x, target = room.part(code.select(kick, q, p)).place, room.part(code.select(kick, p, q)).place
         weights = code.at(room.data(0), (kind >> 1) * layout.starts[-1])
         sigma = self._slopes
         if sigma is None:
@@ -183,7 +183,7 @@ class _Impulse:
         self.side = FEATURES if room.width == 1 else 1  # features in a register
         self.type = Type("double", FEATURES if room.width == 1 else room.width)
         self.block = layout.registers * FEATURES if room.width == 1 else 1
-        self.z, self.s, self.r = (room.part(2 * i * layout.depth * layout.h, room.work) for i in range(3))
+        self.z, self.s, self.r = (room.work.part(2 * i * layout.depth * layout.h).place for i in range(3))
 
     def weights(self, first: Any, count: int) -> list[Value]:
         """Registers of as many weights, from one on."""

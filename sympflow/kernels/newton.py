@@ -483,13 +483,14 @@ class _InMemory(NewtonCode):
         """One step in place: y, the errors of compensated sums, and the count of iterations."""
         found, taken, solved = self._solved(room, numbers, step)
         found.advance(solved)
-        room.add(taken, room.size - 1)
+        count = room.size - 1
+        room[count] = room[count] + taken
 
     def _solved(self, room: Room, numbers: Numbers, step: Value) -> tuple[_Iteration, Value, Value]:
         """The same as in registers."""
         code = room.code
-        rooms = [room.part(sum(self._sizes[:i]), room.work) for i in range(7)]
-        found = _Looped(self, self._wide, room.state, *rooms, *(room.data(i) for i in range(len(self.data))))
+        rooms = [room.work.part(sum(self._sizes[:i])).place for i in range(7)]
+        found = _Looped(self, self._wide, room.place, *rooms, *(room.data(i) for i in range(len(self.data))))
         for i, x in enumerate(self.column(code, numbers, step)):
             found.column[i] = x
         found.fill_letters()
@@ -512,7 +513,7 @@ class _InMemory(NewtonCode):
     ) -> tuple[Values, Values]:
         n, zero = self.n_out, step.code.constant(0.0)
         for k, x in enumerate(values[:n]):
-            room[0].store(x, k)
+            room[0][k] = x
         found, *_ = self._solved(room[0], numbers, step)
         results = found.pulled(cotangents[:n], slopes)
         return [*results[:n], *[zero] * (self.n_values - n)], [zero, *results[n:]]

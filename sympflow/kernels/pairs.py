@@ -19,7 +19,7 @@ import numpy as np
 import sympy as sp
 
 from sympflow.compiler.arrange import Arranged, Arrangement
-from sympflow.compiler.control import INT, POINTER, Code, Type, Value
+from sympflow.compiler.control import INT, POINTER, Code, Rows, Type, Value
 from sympflow.compiler.functions import apply, fma, summed
 from sympflow.compiler.machine import address
 from sympflow.hamiltonian.bodies import PairsHamiltonian
@@ -285,9 +285,9 @@ class BodiesInMemory(SharedMemory):
                 for k in range(self._dim):
                     at, place = size * (s * self._dim + k) + i, (n * s + i) * self._dim + k
                     if loads:
-                        code.store(code.load(start, place), room.state, at)
+                        code.store(code.load(start, place), room.place, at)
                     else:
-                        code.store(code.load(room.state, at), start, place)
+                        code.store(code.load(room.place, at), start, place)
 
 
 class PairSums(Forces):
@@ -313,23 +313,23 @@ class PairSums(Forces):
     def _stage(self, state: Value, context: Value, kind: Value, *numbers: Value) -> None:
         code, column = state.code, [state.code.splat(x, LANES) for x in numbers]
         blocks = (field(context, "size") * (self.dim * (4 if self.splitting.compensated else 2))) >> SHIFT
-        room = Room(code, LANES, state, place(context, "work"), blocks, context)
+        room = Room(state, LANES, place(context, "work"), blocks, context)
         for k, terms in enumerate(self.splitting.terms):
             with code.given(code.apply("eq", (kind, k + 1))):
                 self._stages.kicked(room, terms, column)
         self._stages.drifted(room, column)
 
-    def velocity(self, room: Room, p: Value, out: Value, d: Value, letters: Sequence[Any]) -> None:
+    def velocity(self, room: Room, p: Rows, out: Rows, d: Value, letters: Sequence[Any]) -> None:
         code, sites, count = room.code, place(room.places, "sites"), field(room.places, "size") >> SHIFT
         with code.over(count) as i:
             w = code.load(sites, i << SHIFT, _LANES)
             for k in range(self.dim):
                 at = count * k + i
-                room.store(w * room.load(at, p), at, out)
+                out[at] = w * p[at]
 
-    def sum(self, order: int, room: Room, given: Sequence[Value], out: Value, d: Value, letters: Sequence[Any]) -> None:
+    def sum(self, order: int, room: Room, given: Sequence[Rows], out: Rows, d: Value, letters: Sequence[Any]) -> None:
         kind = tuple(KINDS)[order]
-        room.code.outlined(f"sum_{kind}", (room.places, room.state, given[-1], out), self._sum(kind))
+        room.code.outlined(f"sum_{kind}", (room.places, room.place, given[-1].place, out.place), self._sum(kind))
 
     @contextmanager
     def _blocks(self, size: Value) -> Iterator[Value]:
@@ -465,7 +465,7 @@ class PairCode(SharedRollouts):
         return len(self._stages.splitting.numbers)
 
     def stage(self, room: Any, numbers: Numbers, kind: Value, step: Value) -> Any:
-        self._stages.stage(room.places, room.state, kind, [numbers(i) for i in range(self.size)])
+        self._stages.stage(room.places, room.place, kind, [numbers(i) for i in range(self.size)])
 
     def members(self, meeting: np.ndarray, stop: np.ndarray, threads: int, block: int) -> Callable[[int], Member]:
         local, stages = self._local, self._stages

@@ -356,39 +356,19 @@ MEMORY = [INT, INT, POINTER, POINTER]
 three states, and after these for what stages need, times the width; an array of the addresses of what they read."""
 
 
-class Room:
-    """A state of any `size` in memory: its number i of all trajectories side by side lies at i times the width.
+class Room(Rows):
+    """A state of any `size` in memory: its numbers, each of all trajectories side by side.
 
-    `work` is the address of room for other numbers, `places` that of an array of addresses.
+    Behind them is room for others, `work`; `places` is the address of an array of addresses.
     """
 
-    def __init__(self, code: Code, width: int, state: Value, work: Value, size: Value, data: Value) -> None:
-        self.code, self.width, self.state, self.work, self.size, self.places = code, width, state, work, size, data
-        self.type = Type("double", width)
-
-    @property
-    def rows(self) -> Rows:
-        """The numbers of the state."""
-        return Rows(self.state, self.type)
+    def __init__(self, state: Value, width: int, work: Value, size: Value, places: Value) -> None:
+        super().__init__(state, Type("double", width))
+        self.width, self.work, self.size, self.places = width, Rows(work, self.type), size, places
 
     def data(self, i: int) -> Value:
         """The address of array i of those that a stage reads."""
         return self.code.load(self.places, i, POINTER)
-
-    def load(self, i: Any, place: Value | None = None) -> Value:
-        """The number i of the state, or of others from a place on."""
-        return self.code.load(self.state if place is None else place, i * self.width, self.type)
-
-    def store(self, x: Any, i: Any, place: Value | None = None) -> None:
-        x = self.code.operand(x, self.type)
-        self.code.store(x, self.state if place is None else place, i * self.width)
-
-    def add(self, x: Any, i: Any, place: Value | None = None) -> None:
-        self.store(self.load(i, place) + x, i, place)
-
-    def part(self, i: Any, place: Value | None = None) -> Value:
-        """The address of number i."""
-        return self.code.at(self.state if place is None else place, i * self.width)
 
 
 class _History:
@@ -466,7 +446,7 @@ class Memory(_States[Room, Value]):
         self.n_values, self.n_out, work, data = arguments
         self._alive = code.variable(code.constant(1, Type("i1", width)))
         places = [code.at(work, self.n_values * (i * width)) for i in range(4)]
-        self.rooms = [Room(code, width, x, places[3], self.n_values, data) for x in places[:3]]
+        self.rooms = [Room(x, width, places[3], self.n_values, data) for x in places[:3]]
         self._running, self._end, self._before = self.rooms
 
     def open(self, rows: Value, begin: Value, n_rows: Value, given: int | None = None, own: int = 0) -> None:
@@ -475,10 +455,10 @@ class Memory(_States[Room, Value]):
         with self.code.over(self.width) as k:
             start = self.code.at(rows, self.code.apply("min", (begin + k, n_rows - 1)) * (n + own))
             with self.code.over(n) as i:
-                self.code.store(self.code.load(start, i), self._running.state, i * self.width + k)
+                self.code.store(self.code.load(start, i), self._running.place, i * self.width + k)
         if given is not None:
             with self.code.over(self.n_values - n) as i:
-                self._running.store(0.0, n + i)
+                self._running[n + i] = 0.0
 
     def change(self, column: Callable[..., Any], j: Value, step: Value, end: bool = False) -> None:
         column(j, self._end if end else self._running, step)
@@ -486,7 +466,7 @@ class Memory(_States[Room, Value]):
     def record(self, history: _History, s: Value) -> None:
         start = history.place(s)
         with self._blocks() as (i, type):
-            self.code.store(self.code.load(self._running.state, i, type), start, i)
+            self.code.store(self.code.load(self._running.place, i, type), start, i)
 
     def look(self, look: Callable[[Any], Any]) -> None:
         look(self._running)
@@ -503,20 +483,20 @@ class Memory(_States[Room, Value]):
 
     def _copy(self, source: Room, target: Room) -> None:
         with self._blocks() as (i, type):
-            self.code.store(self.code.load(source.state, i, type), target.state, i)
+            self.code.store(self.code.load(source.place, i, type), target.place, i)
 
     def finite(self) -> Value:
         zero = self.code.constant(0.0, Type("double", self.at_once * self.width))
         total = self.code.variable(zero)
         with self._blocks() as (i, type):
-            total.value = self.code.fma(self.code.load(self._end.state, i, type), zero, total.value)
+            total.value = self.code.fma(self.code.load(self._end.place, i, type), zero, total.value)
         good = self.code.apply("eq", (total.value, 0.0))
         self._alive.value = self._alive.value & (good if self.at_once == 1 else ~self.code.any(~good))
         return self.code.any(self._alive.value)
 
     def _write(self, room: Room, n: Value, out: Value, begin: Value, n_rows: Value, stride: Value, at: Value) -> None:
         with self.code.over(there(self.code, self.width, begin, n_rows)) as k:
-            source, start = self.code.at(room.state, k), self.code.at(out, ((begin + k) * stride + at) * n)
+            source, start = self.code.at(room.place, k), self.code.at(out, ((begin + k) * stride + at) * n)
             with self.code.over(n) as i:
                 self.code.store(self.code.load(source, i * self.width), start, i)
 

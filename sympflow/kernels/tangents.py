@@ -134,7 +134,7 @@ class TangentCode(SplittingCode):
 
     def _executed(self, kind: int, values: Any, column: Sequence[Value]) -> Any:
         d, width = self._d, 2 * self._d
-        x = values.rows if isinstance(values, Room) else [*values]
+        x = values if isinstance(values, Room) else [*values]
         found = self._kinds[kind].body(*(x[m] for m in range(width)), *column)
         for m in range(width):
             x[m] = found[m]
@@ -158,7 +158,7 @@ class TangentCode(SplittingCode):
 
     def look(self, values: Any) -> Any:
         """Divide vectors by the power of two next to their lengths, whose exponents are added up."""
-        x = values.rows if isinstance(values, Room) else [*values]
+        x = values if isinstance(values, Room) else [*values]
         for i, last in self._vectors(values):
             w, x[last] = _rescaled([x[i + m] for m in range(2 * self._d)], x[last])
             for m, y in enumerate(w):

@@ -106,7 +106,7 @@ class SharedMemory(Memory, ABC):
 
     def open(self, rows: Value, begin: Value, n_rows: Value, given: int | None = None, own: int = 0) -> None:
         with self._blocks() as (i, type):
-            self.code.store(self.code.constant(0.0, type), self._running.state, i)
+            self.code.store(self.code.constant(0.0, type), self._running.place, i)
         self.copied(self._running, rows, begin, self._sets if given is None else 2, True)
 
     def store(self, out: Value, begin: Value, n_rows: Value, stride: Value, at: Value) -> None:
