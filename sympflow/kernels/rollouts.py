@@ -175,17 +175,22 @@ class Rollouts(ABC):
         return columns
 
     def own_columns(self, table: Any, values: np.ndarray, width: int) -> Columns:
-        """The columns of trajectories with their own values (N, n): a table for every `width` of them."""
-        entries, kinds = self.own_entries(table, values)
+        """The columns of trajectories with their own values (N, n): a table for every `width` of them.
+
+        The values are a place, where there are columns (…, m, size) for each of them.
+        """
+        if isinstance(table, tuple) and table[0].ndim > 2:
+            entries, kinds = table[0][values[:, 0].astype(int)], table[1]
+        else:
+            entries, kinds = self.own_entries(table, values)
         groups = -(-len(entries) // width)
         if len(entries) < groups * width:
             entries = np.concatenate([entries, entries[-1:].repeat(groups * width - len(entries), axis=0)])
         return np.ascontiguousarray(entries.reshape(groups, width, *entries.shape[1:]).transpose(0, 2, 3, 1)), kinds
 
     def own_entries(self, table: Any, values: np.ndarray) -> Columns:
-        """The numbers (N, m, size) of the columns of each, and their kinds (m,); `values` are places in the table."""
-        entries, kinds = table
-        return entries[values[:, 0].astype(int)], kinds
+        """The numbers (N, m, size) of the columns of each, and their kinds (m,), where trajectories may have values."""
+        raise NotImplementedError
 
     def summed(self, kinds: np.ndarray) -> np.ndarray:
         """The sums over trajectories that a reverse of columns of these kinds left, such as derivatives by weights."""

@@ -595,8 +595,6 @@ class SplittingCode(SplittingRollouts):
 
     def own_entries(self, table: Any, values: np.ndarray) -> Columns:
         """The numbers of the columns of trajectories with their own values of the parameters."""
-        if isinstance(table, tuple):
-            return super().own_entries(table, values)
         kinds, n = self._kinds_of(table), len(table) - self.own
         values = np.broadcast_to(values.T[:, None], (values.shape[1], len(kinds), len(values)))
         rows = [*table[:n, :, None], *values]
