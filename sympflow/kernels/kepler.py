@@ -527,7 +527,6 @@ class KeplerLoops:
                 f"`system` has {n} planets with a mass, and compiled code is for 1 to {MOST_GROUPS * LANES - 1}"
             )
         self.frame, self._light = frame, light
-        self._codes: dict[tuple[Form, int, int], KeplerCode] = {}
         groups = self.code(Form()).groups
         spare = LANES * groups - n
         self._spare = np.zeros((spare, 2 * AXES))
@@ -567,10 +566,9 @@ class KeplerLoops:
         n = len(self._light)
         return n * k // threads, n * (k + 1) // threads
 
+    @kept
     def _made(self, form: Form, k: int, threads: int) -> KeplerCode:
-        if (form, k, threads) not in self._codes:
-            self._codes[form, k, threads] = KeplerCode(self.frame, form, slice(*self._ends(k, threads)))
-        return self._codes[form, k, threads]
+        return KeplerCode(self.frame, form, slice(*self._ends(k, threads)))
 
     def rows(self, y: np.ndarray, spare: float = 1.0) -> np.ndarray:
         """The running states (..., n_values) of states (..., 2d); of deviation vectors with a `spare` of 0."""

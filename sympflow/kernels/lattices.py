@@ -29,6 +29,7 @@ from sympflow.hamiltonian.monomials import Monomials
 from sympflow.kernels.rollouts import aligned, zeros
 from sympflow.kernels.runs import Numbers, Room
 from sympflow.kernels.teams import Member, SharedMemory, SharedRollouts, meet
+from sympflow.lazy import kept
 from sympflow.schemes import CURVATURE
 
 __all__ = ["LatticeCode"]
@@ -909,19 +910,21 @@ class LatticeCode(SharedRollouts):
         self._stages = _stages(Form.of(lattice, self._order, level, compensated, damped, width, even))
         self._functions, self._lock = self._stages.functions, self._stages.lock
         self.memory = partial(LatticeInMemory, self._stages)
-        self.work, self.terms, self._slabs = lattice.ndof, 1 + level, dict[int, Slabs]()
+        self.work, self.terms = lattice.ndof, 1 + level
 
     @cached_property
     def size(self) -> int:
         return len(self._stages.form.column)
 
+    @kept
+    def _slabs(self, threads: int) -> Slabs:
+        return Slabs(self._given[0], self._stages, self._order, threads)
+
     def stage(self, room: Any, numbers: Numbers, kind: Value, step: Value) -> Any:
         self._stages.stage(room, numbers, kind)
 
     def members(self, meeting: np.ndarray, stop: np.ndarray, threads: int, block: int) -> Callable[[int], Member]:
-        slabs = self._slabs.get(threads)
-        if slabs is None:
-            slabs = self._slabs[threads] = Slabs(self._given[0], self._stages, self._order, threads)
+        slabs = self._slabs(threads)
         rooms = [aligned(3 * slabs.size) for _ in range(threads)]
         helpers = [zeros(slabs.helpers) for _ in range(threads)]
         found = np.zeros(threads, dtype=np.int64)

@@ -6,7 +6,7 @@ modes and what is made of these alone; then of a driven system when the map acts
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache, cached_property, lru_cache, partial
 from itertools import pairwise
@@ -89,13 +89,12 @@ class PartMaps:
         self.codes: dict[tuple[tuple[int, ...], ...], PartsCode] = {}
         self._arranged: dict[int, Arranged] = {}
 
+    @kept
     def arranged(self, code: int) -> Arranged:
         """The map of a part, from x, y and letters of the time and what its table makes of a column's numbers."""
-        if code not in self._arranged:
-            bends = code >= WITH_GRADIENT
-            shapes = [self._part(code % WITH_GRADIENT, bends, expand) for expand in (True, False)[: 1 + bends]]
-            self._arranged[code] = min(shapes, key=lambda shape: shape[0])[1]
-        return self._arranged[code]
+        bends = code >= WITH_GRADIENT
+        shapes = [self._part(code % WITH_GRADIENT, bends, expand) for expand in (True, False)[: 1 + bends]]
+        return min(shapes, key=lambda shape: shape[0])[1]
 
     def _part(self, number: int, bends: bool, expand: bool) -> tuple[int, Arranged]:
         """x + b J∇H_k(x), and with a force gradient g ∇²U M⁻¹∇U added to y; its cost before it."""
@@ -287,6 +286,7 @@ class PartsLoops:
         self.parts, self.driven = parts, parts.driven
         self._scales = Scales(parts)
         self._of(())  # which says what has no compiled form
+        self._maps(False)  # which refuses what has no compiled form
         self._tables: dict[int, tuple[Sequence[SubFlow], _Table]] = {}
 
     def kernel(self, maps: Maps) -> PartsKernel:
@@ -381,12 +381,22 @@ class PartsLoops:
         if key not in maps.codes:
             maps.codes[key] = PartsCode(maps, key)
         return maps.codes[key]
+        return self._maps(any(m.filters is not None for m in sequence))
+
+    @kept
+    def _maps(self, filters: bool) -> PartMaps:
+        return PartMaps(self.parts, filters)
+
+    @kept
+    def _code(self, maps: PartMaps, groups: frozenset[tuple[int, ...]]) -> PartsCode:
+        return PartsCode(maps, sorted(groups))
 
     def _singles(self, maps: PartMaps) -> PartsCode:
         """The code of one map a column."""
         numbers = range(1, len(self.parts.rest) + 1)
         bent = [WITH_GRADIENT + k for k in numbers if self.parts.has_force_gradient]
-        return self._code(maps, [(k,) for k in (IDLE, *([LINEAR] if self.parts.linear else []), *numbers, *bent)])
+        alone = (IDLE, *([LINEAR] if self.parts.linear else []), *numbers, *bent)
+        return self._code(maps, frozenset((k,) for k in alone))
 
     def table(self, sequence: Sequence[SubFlow], n: int, maps: PartMaps) -> tuple[np.ndarray, np.ndarray]:
         """Codes (m,) and numbers (n, m, size), those of the time, of a driven system, still 0: see `timed`."""
@@ -447,7 +457,7 @@ class PartsLoops:
         for size in range(len(rest) + 1, 0, -1):
             head, inner = rest[: size - 1], [rest[i : i + size] for i in range(size - 1, len(rest), size)]
             groups = [[first, *head], *inner, [link, *head], [closing]]
-            kinds = {tuple(map(_code_of, group)) for group in groups}
+            kinds = frozenset(tuple(map(_code_of, group)) for group in groups)
             if sum(of.operations(k) for kind in kinds for k in kind) <= MOST_OPERATIONS:
                 break
         maps = [m for group in groups for m in group]

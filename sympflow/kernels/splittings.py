@@ -22,6 +22,7 @@ from sympflow.hamiltonian.monomials import Monomials
 from sympflow.kernels.rollouts import Columns, SplittingRollouts
 from sympflow.kernels.runs import Numbers, Room, Values, assign, step_function
 from sympflow.kernels.stages import Kick, kick_of
+from sympflow.lazy import lately_kept
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT
 
 if TYPE_CHECKING:
@@ -31,7 +32,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Shape", "Splitting", "SplittingCode", "WithinRange"]
 
-MOST_TABLES = 64  # that are kept
 LONG = 64  # operations of a stage, beyond which products of sums may better be left
 CLOCK = 3  # numbers of the time in a column
 EARLY = -4  # when momenta are known before the positions, in cycles
@@ -385,7 +385,6 @@ class SplittingCode(SplittingRollouts):
 
     def __init__(self, splitting: Splitting, chunked: bool | None = None) -> None:
         self._splitting, self._given = splitting, (splitting,)
-        self._tables: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
         super().__init__(2 * splitting.ndof * (1 + splitting.compensated), 2 * splitting.ndof)
         self.timed = splitting.timed
         self.chunked = self.timed or not splitting.polynomial if chunked is None else chunked
@@ -562,13 +561,11 @@ class SplittingCode(SplittingRollouts):
         """The numbers (m, size) that the code reads, of a table (n, m) of given ones, and the kinds (m,) of columns."""
         if self.timed:
             return self.columns(table)
-        key = table.tobytes()
-        found = self._tables.get(key)
-        if found is None:
-            if len(self._tables) >= MOST_TABLES:
-                self._tables.clear()
-            found = self._tables[key] = self.columns(table)
-        return found
+        return self._known_columns(table.tobytes(), len(table))
+
+    @lately_kept
+    def _known_columns(self, numbers: bytes, n: int) -> Columns:
+        return self.columns(np.frombuffer(numbers).reshape(n, -1))
 
     def columns(self, table: np.ndarray) -> Columns:
         kinds = self._kinds_of(table)

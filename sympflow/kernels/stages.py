@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sympflow.compiler import NotCompiled
+from sympflow.lazy import lately_kept
 from sympflow.schemes import POLYNOMIAL, Scheme
 
 if TYPE_CHECKING:
@@ -49,16 +50,10 @@ class StageTable:
         n = len(self.numbers) if self.level == POLYNOMIAL else 2 + self.level
         return np.ascontiguousarray(np.concatenate([self.numbers[:n], *(() if self.more is None else [self.more])]))
 
+    @lately_kept
     def rows(self, values: tuple[float, ...]) -> np.ndarray:
         """`packed`, and for each of the values of a system's parameters a row, the same for all stages."""
-        if not values:
-            return self.packed
-        rows = self._with_values.get(values)
-        if rows is None:
-            rows = self.with_constants(values)
-            self._with_values.clear()  # systems with other values come one after the other
-            self._with_values[values] = rows
-        return rows
+        return self.with_constants(values)
 
     def with_constants(self, values: Sequence[Any]) -> np.ndarray:
         """`packed`, and rows of these values."""
@@ -75,10 +70,6 @@ class StageTable:
         for row, value in zip(rows if rows.ndim == 2 else rows[..., 0], values, strict=True):
             row[:] = value
         return rows
-
-    @cached_property
-    def _with_values(self) -> dict[tuple[float, ...], np.ndarray]:
-        return {}
 
     def valued(self, x: np.ndarray, h: np.ndarray) -> StageTable:
         """The numbers of steps of lengths h (N,) by the polynomials of x (N,): of each stage all rows, (m N,)."""

@@ -176,7 +176,6 @@ class Terms:
     def __init__(self, f: sp.Expr, variables: Sequence[sp.Symbol], letters: Sequence[sp.Symbol] = ()) -> None:
         self._given = f, tuple(variables), tuple(letters)
         self._families, self._letters = families(f, variables), tuple(letters)
-        self._programs: dict[tuple[int, bool], list[Program]] = {}
         self.data = [np.array([len(family.coordinates) for family in self._families], dtype=np.int64)]
         for family in self._families:
             self.data += [family.coordinates.astype(np.int64), family.constants]
@@ -195,14 +194,12 @@ class Terms:
             )
         return self
 
+    @kept
     def derivatives(self, times: int, bends: bool = False) -> list[Program]:
         """∇f, ∇²f v or ½ ∇³f(v, v) of a term of each kind, by the `times` along v; with `bends` their slopes behind."""
-        key = times, bends
-        if key not in self._programs:
-            self._programs[key] = [self._derived(family, *key) for family in self._families]
-        return self._programs[key]
+        return [self._derived(family, times, bends) for family in self._families]
 
-    def _derived(self, family: Family, times: int, bends: bool = False) -> Program:
+    def _derived(self, family: Family, times: int, bends: bool) -> Program:
         """∇f, that often differentiated along v, and divided by the factorial; with its own derivatives."""
         n, along = len(family.x), [f"v_{j}" for j in range(len(family.x) if times else 0)]
         given = (*family.x, *family.c, *self._letters)
