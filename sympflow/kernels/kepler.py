@@ -719,7 +719,7 @@ class KeplerKernel(Kernel):
         lengths = np.broadcast_to(np.asarray(h, dtype=np.float64), (N,))
         rows = np.concatenate([self.loops.rows(y), self.loops.rows(vectors, 0.0).reshape(N, k * code.whole)], axis=1)
         columns = self._table(lengths, (), self.before, self.substeps, self.after)
-        rows = code.single_steps(*columns, rows).states.reshape(N, 1 + k, code.whole)
+        rows = code.single_steps(*columns, rows).reshape(N, 1 + k, code.whole)
         moved = self.loops.moved(rows[:, 1:], vectors, lengths[:, None])
         return self.loops.moved(rows[:, 0], y, lengths), moved.swapaxes(-1, -2)
 

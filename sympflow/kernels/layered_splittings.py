@@ -25,7 +25,7 @@ from sympflow.compiler.program import Program
 from sympflow.hamiltonian.layered import LayeredPotential
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.kernels.rollouts import LINE, Columns, SplittingRollouts, zeros
-from sympflow.kernels.runs import Numbers, Room, Values
+from sympflow.kernels.runs import Numbers, Room, Values, step_function
 
 __all__ = ["LayeredCode"]
 
@@ -87,6 +87,27 @@ class LayeredCode(SplittingRollouts):
         v = [-(b * x) for x in of_p]
         bend = _Layers(self._potential, values[0], kind, slopes).slopes(values[:d], v)
         return [*(x + y for x, y in zip(of_q, bend, strict=True)), *of_p], []
+
+    def made(self, name: str, width: int) -> Callable[..., None]:
+        if name != "step":
+            return super().made(name, width)
+
+        def stage(values: list[Value], numbers: Numbers, kind: Value, step: Value) -> list[Value]:
+            place = numbers(2)
+            where = place if width == 1 else place.code.lane(place, 0)
+            return self.stage(values, numbers, place.code.convert("fptosi", where, "i64"), step)
+
+        return step_function(self.n_values, self.n_out, [1, 1, 0], 0, lambda time, *given: given, stage, width)
+
+    def step_rows(
+        self, table: np.ndarray, x: np.ndarray, h: np.ndarray, t: np.ndarray, y: np.ndarray, out: np.ndarray
+    ) -> None:
+        width = 1 if len(y) == 1 else self.lanes
+        _, kinds = self.prepared(table[..., 0])
+        where = np.zeros((1, *table.shape[1:]))
+        where[..., 0] = kinds  # addresses are whole numbers that doubles hold
+        full = np.concatenate([table, where])
+        self.call("step", width, full, full.shape[1], full.shape[2], x, h, t, y, len(y), out)
 
 
 class _Layers:

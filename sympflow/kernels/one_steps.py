@@ -13,8 +13,8 @@ from sympflow.compiler import NotCompiled
 from sympflow.compiler.control import Code, Value
 from sympflow.hamiltonian.formulas import MOST_COMPILED, TracedHamiltonian, TracedLetters
 from sympflow.kernels.protocol import Kernel, Run, Steps, Task, run_states
-from sympflow.kernels.rollouts import START, Columns, Rollouts, shared
-from sympflow.kernels.runs import Numbers
+from sympflow.kernels.rollouts import Columns, Rollouts, shared
+from sympflow.kernels.runs import Numbers, step_function
 from sympflow.kernels.threads import given
 
 if TYPE_CHECKING:
@@ -121,6 +121,22 @@ class OneStep(Rollouts):
         entries[:, :, 1 : 1 + self.parameters] = values[:, None]
         return entries, table[1]
 
+    def made(self, name: str, width: int) -> Callable[..., None]:
+        if name != "step":
+            return super().made(name, width)
+        # All numbers follow the states in their rows, which have the count behind them.
+        n, size = self.n_out + self.counted, self.size
+        return step_function(n, n, [0] * size, size, lambda _, *numbers: numbers, self.stage, width, self.place)
+
+    def steps(self, y: np.ndarray, numbers: np.ndarray) -> Steps:
+        """One step from every row of `y` (N, 2d) by its own numbers (N, size)."""
+        n = self.n_out + self.counted
+        rows = np.concatenate([y, np.zeros((len(y), int(self.counted))), numbers], axis=1)
+        out, nothing, h = np.empty((len(y), n)), np.zeros((self.size, 1, 1)), np.zeros(len(y))
+        width = self.lanes if len(y) >= self.fewest else 1
+        self.call("step", width, nothing, 1, 1, h, h, h, rows, len(y), out, n_out=n)
+        return Steps(out[:, : self.n_out].copy(), int(out[:, -1].sum())) if self.counted else Steps(out)
+
     def column(self, code: Code, numbers: Numbers, step: Value) -> list[Value]:
         """The numbers of a column, with the time at which the step begins."""
         return self.begun([numbers(i) for i in range(self.size)], code.convert("sitofp", step, "double"))
@@ -195,4 +211,4 @@ class OneStepKernel(Kernel):
         """One step from each row of `y` (N, 2d), each of its own length `h` (N,): see `Kernel`."""
         y = given(y)
         h, t = (given(np.broadcast_to(x, y.shape[:1])) for x in (h, t))
-        return self._single.single_steps(self._numbers(h, t)[:, None], START, y)
+        return self._single.steps(y, self._numbers(h, t))

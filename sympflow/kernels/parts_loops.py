@@ -325,7 +325,7 @@ class PartsLoops:
         codes, entries = self.table(sequence, len(y), maps)
         entries = self.timed(sequence, entries, t, h)
         code = self._singles(maps)
-        return self.states(code.single_steps(*code.columns([(k,) for k in codes.tolist()], entries), start).states)
+        return self.states(code.single_steps(*code.columns([(k,) for k in codes.tolist()], entries), start))
 
     def step_modes(self, sequence: Sequence[SubFlow], modes: np.ndarray) -> np.ndarray:
         """The maps applied once to every row [X, Y] of `modes` (N, 2d), which stay modes."""

@@ -15,7 +15,7 @@ from sympflow.compiler import NotCompiled
 from sympflow.compiler.control import Value
 from sympflow.compiler.machine import address, given
 from sympflow.compiler.program import Program, adjoint, traced
-from sympflow.kernels.protocol import Batch, Steps, Task, begun_in, end_finite, run_states
+from sympflow.kernels.protocol import Batch, Task, begun_in, end_finite, run_states
 from sympflow.kernels.runs import BLOCK, Memory, Numbers, Room, Values, map_function, reverse_function, run_function
 from sympflow.kernels.stages import evaluated
 from sympflow.kernels.threads import NEVER
@@ -228,11 +228,11 @@ class Rollouts(ABC):
         """The addresses of the data."""
         return np.array([*map(address, self.data)], dtype=np.int64)
 
-    def call(self, name: str, width: int, *arguments: Any) -> None:
+    def call(self, name: str, width: int, *arguments: Any, n_out: int | None = None) -> None:
         """Call the compiled function of a name with arrays and integers."""
         if self.room is not None:
             work = aligned((3 * self.n_values + self.room) * width)
-            arguments = *arguments, self.n_values, self.n_out, work, self._places
+            arguments = *arguments, self.n_values, self.n_out if n_out is None else n_out, work, self._places
         self.function(name, width)(*given(arguments))
 
     def run(self, table: Any, batch: Batch, closed: bool = True) -> None:
@@ -302,14 +302,13 @@ class Rollouts(ABC):
         width = 1 if len(y) == 1 else self.lanes
         self.call("map", width, entries, kinds, len(kinds), steps, len(steps), y, len(y), out)
 
-    def single_steps(self, entries: np.ndarray, kinds: np.ndarray, y: np.ndarray) -> Steps:
+    def single_steps(self, entries: np.ndarray, kinds: np.ndarray, y: np.ndarray) -> np.ndarray:
         """One step from every row of `y` (N, 2d) by columns of its own: (N, m, size), of these kinds (m,)."""
         nothing = np.zeros((len(y), 2, self.size))
         columns = np.concatenate([entries, nothing], axis=1), np.append(kinds, [0, 0])
         rollout, task = partial(self.run, columns, closed=False), Task(0.0, y, 1, ONE)
         start = np.column_stack([y, np.arange(len(y), dtype=float)])
-        found = run_states(rollout, task, self.n_values, 0.0, start, self.counted)
-        return Steps(found.states[:, 0], found.iterations)
+        return run_states(rollout, task, self.n_values, 0.0, start).states[:, 0]
 
 
 class SplittingRollouts(Rollouts):
@@ -326,7 +325,7 @@ class SplittingRollouts(Rollouts):
         """One step from every row of `y` (N, 2d) by its own numbers: a table (n, m N), a column of all rows each."""
         n = len(y)
         entries, kinds = self.columns(table)
-        return self.single_steps(entries.reshape(-1, n, self.size).swapaxes(0, 1), kinds[::n], y).states
+        return self.single_steps(entries.reshape(-1, n, self.size).swapaxes(0, 1), kinds[::n], y)
 
     def columns(self, table: np.ndarray) -> Columns:
         """The columns of a table of numbers."""

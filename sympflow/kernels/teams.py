@@ -137,7 +137,7 @@ class SharedRollouts(SplittingRollouts):
             kinds[table[k] != 0] = k
         return np.ascontiguousarray(table.T), kinds
 
-    def call(self, name: str, width: int, *arguments: Any) -> None:
+    def call(self, name: str, width: int, *arguments: Any, n_out: int | None = None) -> None:
         """Call a compiled run or map; one state is shared by several threads where that pays."""
         if name == "run":
             n_rows, n_columns = arguments[5], arguments[2] * (arguments[7] - arguments[6])
