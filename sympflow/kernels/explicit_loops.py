@@ -191,7 +191,6 @@ class _InMemory(_Explicit):
         data = [room.data(i) for i in range(len(self.data))]
         for i, row in enumerate(self.A):
             for k, x in enumerate([*column[1 : 1 + self.parameters], *self.letters_at(column, sum(row))]):
-                code.store(code.operand(x, DOUBLE), letters, k)
                 letters[k] = x
             self._move(room, Y, column[0], row, K)
             places = [x.place for x in (Y, K[i], g, letters)]

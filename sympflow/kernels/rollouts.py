@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
 from functools import cached_property, partial
 from typing import Any
@@ -16,7 +16,17 @@ from sympflow.compiler.control import Value
 from sympflow.compiler.machine import address, given
 from sympflow.compiler.program import Program, adjoint, traced
 from sympflow.kernels.protocol import Batch, Task, begun_in, end_finite, run_states
-from sympflow.kernels.runs import BLOCK, Memory, Numbers, Room, Values, map_function, reverse_function, run_function
+from sympflow.kernels.runs import (
+    BLOCK,
+    Memory,
+    Numbers,
+    Room,
+    Values,
+    assign,
+    map_function,
+    reverse_function,
+    run_function,
+)
 from sympflow.kernels.stages import evaluated
 from sympflow.kernels.threads import NEVER
 
@@ -132,12 +142,17 @@ class Rollouts(ABC):
         column = [numbers(i, lone=True) for i in range(self.size)]
         given = [*values, *column, code.convert("sitofp", step, "double"), *cotangents]
         found = [code.variable(code.constant(0.0, type)) for _ in range(n + self.size * slopes)]
-        for k, program in enumerate(self._reversed):
+        for k in self.given_kind(kind):
+            program = self._reversed[k]
             asked = Program(program.inputs, program.outputs[: len(found)])
-            with code.given(code.apply("eq", (kind, k))) if self.kinds > 1 else nullcontext():
-                for result, x in zip(found, asked(*given), strict=True):
-                    result.value = code.operand(x, type)
+            assign(found, [code.operand(x, type) for x in asked(*given)])
         return [x.value for x in found[:n]], [x.value for x in found[n:]]
+
+    def given_kind(self, kind: Value) -> Iterator[int]:
+        """Each kind of stage: what is written for it is executed for columns of this kind."""
+        for k in range(self.kinds):
+            with kind.code.given(kind.code.apply("eq", (kind, k))) if self.kinds > 1 else nullcontext():
+                yield k
 
     def plain(self, kind: int, state: Sequence[Any], column: Sequence[Any], step: Any) -> Sequence[Any]:
         """The state after a stage of a kind, of recorded numbers: `stage`, up to rounding, to be differentiated."""

@@ -5,8 +5,7 @@ A kick is p − b∇V + g∇²V v − c∇(½ v·∇²V v) with v = M⁻¹∇V, 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import nullcontext
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
@@ -20,7 +19,7 @@ from sympflow.compiler.program import Program, Traced, adjoint, derivatives, gra
 from sympflow.hamiltonian.formulas import evaluator
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.kernels.rollouts import Columns, SplittingRollouts
-from sympflow.kernels.runs import Numbers, Room, Values, assign, step_function
+from sympflow.kernels.runs import Numbers, Room, assign, step_function
 from sympflow.kernels.stages import Kick, kick_of
 from sympflow.lazy import lately_kept
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT
@@ -406,23 +405,17 @@ class SplittingCode(SplittingRollouts):
     def stage(self, values: Any, numbers: Numbers, kind: Value, step: Value) -> Any:
         """A kick and a drift, of the kind that a column has, of values or of a state in memory."""
         if isinstance(values, Room):
-            for k in self._given_kind(kind):
+            for k in self.given_kind(kind):
                 self._executed(k, values, self._column(k, values.type, numbers, step))
             return None
         results = [step.code.variable(x) for x in values]
-        for k in self._given_kind(kind):
+        for k in self.given_kind(kind):
             assign(results, self._executed(k, values, self._column(k, values[0].type, numbers, step)))
         return [x.value for x in results]
 
-    def _given_kind(self, kind: Value) -> Iterator[int]:
-        """Each kind of stage: what is written for it is executed for columns of this kind."""
-        for k in range(len(self._kinds)):
-            with kind.code.given(kind.code.apply("eq", (kind, k))) if len(self._kinds) > 1 else nullcontext():
-                yield k
-
     def over(self, each: Callable[..., None], numbers: Numbers, kind: Value, step: Value) -> None:
         type = numbers(0).type
-        for k in self._given_kind(kind):
+        for k in self.given_kind(kind):
             column = self._column(k, type, numbers, step)
             each(lambda values, k=k, column=column: self._executed(k, values, column))
 
@@ -468,32 +461,13 @@ class SplittingCode(SplittingRollouts):
 
     def check_reverse(self) -> None:
         """All stages have a reverse."""
-        if not all(isinstance(kind, Stage) for kind in self._kinds) or self._splitting.symbols.samples:
-            super().check_reverse()
-        self._adjoints  # noqa: B018
-
-    def adjoint(
-        self, values: Values, cotangents: Values, numbers: Numbers, kind: Value, step: Value, slopes: bool, *room: Room
-    ) -> tuple[Values, Values]:
-        code, type = step.code, values[0].type
-        zero = code.constant(0.0, type)
-        found: list[Variable] = [code.variable(zero) for _ in range(self.n_values + self.size)]
-        for k in self._given_kind(kind):
-            program = self._adjoints[k]
-            n = len(program.inputs) - 2 * self.n_values - self.timed
-            column = [numbers(i, lone=True) for i in range(n)]
-            if self.timed:
-                column.append(self._time(column, step))
-            results = [code.operand(x, type) for x in program(*values, *column, *cotangents)]
-            assign(found[: len(results)], results)
-        return [x.value for x in found[: self.n_values]], [x.value for x in found[self.n_values :]]
 
     def of_values(self, given: Sequence[Value], cotangents: Sequence[Value], kind: Value) -> list[Value]:
         if self.timed:
             return [*cotangents[self.size - self.own :]]
         code, type = kind.code, cotangents[0].type
         found = [code.variable(code.constant(0.0, type)) for _ in range(self.own)]
-        for k in self._given_kind(kind):
+        for k in self.given_kind(kind):
             program = self._of_tables[k]
             of_values = program(*given, *cotangents[: len(program.inputs) - len(given)])
             assign(found, [code.operand(x, type) for x in of_values])
