@@ -28,6 +28,7 @@ __all__ = [
     "Type",
     "Value",
     "Variable",
+    "assign",
 ]
 
 
@@ -124,6 +125,12 @@ class Variable:
     @value.setter
     def value(self, x: Value) -> None:
         self._code.store(x, self._place)
+
+
+def assign(variables: Sequence[Variable], values: Sequence[Value]) -> None:
+    """Give variables these values."""
+    for variable, x in zip(variables, values, strict=True):
+        variable.value = x
 
 
 class Rows:
@@ -503,8 +510,7 @@ class Code:
         """Return the values after `body(k, values)` for k = 0 … count − 1, none if the count is not positive."""
         variables = [self.variable(x) for x in carried]
         with self.over(count) as k:
-            for variable, x in zip(variables, body(k, [x.value for x in variables]), strict=True):
-                variable.value = x
+            assign(variables, body(k, [x.value for x in variables]))
         return [x.value for x in variables]
 
     @contextmanager
@@ -541,8 +547,7 @@ class Code:
         variables, going = [self.variable(x) for x in carried], self.variable(self.constant(1, BOOL))
         with self.during(lambda: going.value):
             going.value, new = body([x.value for x in variables])
-            for variable, x in zip(variables, new, strict=True):
-                variable.value = x
+            assign(variables, new)
         return [x.value for x in variables]
 
     def when(

@@ -88,10 +88,7 @@ class LayeredCode(SplittingRollouts):
         bend = _Layers(self._potential, values[0], kind, slopes).slopes(values[:d], v)
         return [*(x + y for x, y in zip(of_q, bend, strict=True)), *of_p], []
 
-    def made(self, name: str, width: int) -> Callable[..., None]:
-        if name != "step":
-            return super().made(name, width)
-
+    def step_made(self, width: int, own: bool) -> Callable[..., None]:
         def stage(values: list[Value], numbers: Numbers, kind: Value, step: Value) -> list[Value]:
             place = numbers(2)
             where = place if width == 1 else place.code.lane(place, 0)

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from sympflow.compiler import NotCompiled
-from sympflow.compiler.control import BOOL, DOUBLE, INT, Code, Rows, Type, Value
+from sympflow.compiler.control import BOOL, DOUBLE, INT, Code, Rows, Type, Value, assign
 from sympflow.compiler.functions import added, fma, is_zero, where
 from sympflow.compiler.program import Program, gradient, traced
 from sympflow.hamiltonian.collocation import MOST_ITERATIONS, Tableau, stage_nodes
@@ -458,8 +458,7 @@ class _InRegisters(NewtonCode):
             if type.width > 1:
                 new = [code.select(now, a, b) for a, b in zip(new, before, strict=True)]
                 count, done = code.select(now, count, taken.value), code.select(now, done, small.value)
-            for variable, x in zip(K, new, strict=True):
-                variable.value = x
+            assign(K, new)
             taken.value, small.value, size.value = count, done, found
             active.value = now & ~done & (found < np.inf) & (count < MOST_ITERATIONS)
         return [x.value for x in K], taken.value, small.value

@@ -121,9 +121,7 @@ class OneStep(Rollouts):
         entries[:, :, 1 : 1 + self.parameters] = values[:, None]
         return entries, table[1]
 
-    def made(self, name: str, width: int) -> Callable[..., None]:
-        if name != "step":
-            return super().made(name, width)
+    def step_made(self, width: int, own: bool) -> Callable[..., None]:
         # All numbers follow the states in their rows, which have the count behind them.
         n, size = self.n_out + self.counted, self.size
         return step_function(n, n, [0] * size, size, lambda _, *numbers: numbers, self.stage, width, self.place)

@@ -19,7 +19,7 @@ import numpy as np
 import sympy as sp
 
 from sympflow.compiler.arrange import Arranged, Arrangement
-from sympflow.compiler.control import INT, POINTER, Code, Rows, Type, Value
+from sympflow.compiler.control import INT, POINTER, Code, Rows, Type, Value, assign
 from sympflow.compiler.functions import apply, fma, summed
 from sympflow.compiler.machine import address
 from sympflow.hamiltonian.bodies import PairsHamiltonian
@@ -428,8 +428,7 @@ class PairSums(Forces):
                     return [with_parts(total, of_pair, axis) for axis, total in enumerate(sums)]
 
                 count = ((last + (LANES - 1)) >> SHIFT) - (first >> SHIFT)
-                for variable, total in zip(totals, code.loop(count, [x.value for x in totals], block), strict=True):
-                    variable.value = total
+                assign(totals, code.loop(count, [x.value for x in totals], block))
 
             if cells is None or self.cells is None:
                 meets(i + 1, n)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from sympflow.compiler import NotCompiled
-from sympflow.compiler.control import Value
+from sympflow.compiler.control import Value, assign
 from sympflow.compiler.machine import address, given
 from sympflow.compiler.program import Program, adjoint, traced
 from sympflow.kernels.protocol import Batch, Task, begun_in, end_finite, run_states
@@ -22,7 +22,6 @@ from sympflow.kernels.runs import (
     Numbers,
     Room,
     Values,
-    assign,
     map_function,
     reverse_function,
     run_function,
@@ -226,17 +225,23 @@ class Rollouts(ABC):
         return self._functions[key]
 
     def made(self, name: str, width: int) -> Callable[..., None]:
-        """Compile the function of a name: "run", "kept", "reverse" or "slopes", each " own" too, or "map"."""
+        """Compile the function of a name: "run", "step", "kept", "reverse" or "slopes", each " own" too, or "map"."""
         sizes, memory, (what, _, own_tables) = (self.n_values, self.n_out, self.size), self.place, name.partition(" ")
         if name == "map":
             return map_function(*sizes, self.stage, width, memory, self.timed)
         own, kept = bool(own_tables), what == "kept"
+        if what == "step":
+            return self.step_made(width, own)
         if what in ("reverse", "slopes"):
             asked = what == "slopes", self.closing, memory is not None
             return reverse_function(*sizes, self.adjoint, width, own, *asked, self.of_values, self.given, self.own)
         look, every = (None, self.block) if self.every is None else (self.look, self.every)
         over = self.over if self.chunked and not kept else None
         return run_function(*sizes, self.stage, width, own, memory, look, every, self.closing, over, kept)
+
+    def step_made(self, width: int, own: bool) -> Callable[..., None]:
+        """Compile single steps of rows, of a method that has them: see `sympflow.kernels.runs.step_function`."""
+        raise NotImplementedError
 
     @cached_property
     def _places(self) -> np.ndarray:

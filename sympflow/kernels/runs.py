@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from functools import partial
 from typing import Any, Generic, TypeVar
 
-from sympflow.compiler.control import BOOL, INT, POINTER, Code, Module, Rows, Type, Value, Variable
+from sympflow.compiler.control import BOOL, INT, POINTER, Code, Module, Rows, Type, Value, Variable, assign
 from sympflow.compiler.machine import compiled, host
 
 __all__ = [
@@ -697,11 +697,6 @@ class ColumnStage:
 
     def __call__(self, j: Value, values: Any, step: Value, chunk: Value | None = None) -> Any:
         return self._stage(values, self.numbers(j, chunk), self.kind(j), step)
-
-
-def assign(variables: Sequence[Variable], values: Sequence[Value]) -> None:
-    for variable, value in zip(variables, values, strict=True):
-        variable.value = value
 
 
 def _due(code: Code, save: Value, n_saved: Value, saved: Variable, n: Variable) -> Value:

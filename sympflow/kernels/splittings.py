@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 import numpy as np
 
 from sympflow.compiler.arrange import Arrangement
-from sympflow.compiler.control import Type, Value
+from sympflow.compiler.control import Type, Value, assign
 from sympflow.compiler.functions import FUNCTIONS, added, dot, is_zero, times
 from sympflow.compiler.program import Program, Traced, adjoint, derivatives, gradient, traced
 from sympflow.hamiltonian.formulas import evaluator
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.kernels.rollouts import Columns, SplittingRollouts
-from sympflow.kernels.runs import Numbers, Room, assign, step_function
+from sympflow.kernels.runs import Numbers, Room, step_function
 from sympflow.kernels.stages import Kick, kick_of
 from sympflow.lazy import lately_kept
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT
@@ -496,11 +496,7 @@ class SplittingCode(SplittingRollouts):
             state = self._kinds[k].plain(*state, *self._kinds[k].table(*given))
         return torch.stack([x.expand(y.shape[:-1]) for x in state[: self.n_out]], dim=-1)
 
-    def made(self, name: str, width: int) -> Callable[..., None]:
-        """Compile the function of a name, "step" too."""
-        what, _, own = name.partition(" ")
-        if what != "step":
-            return super().made(name, width)
+    def step_made(self, width: int, own: bool) -> Callable[..., None]:
         powers = [1, *self._splitting.full_kick.powers, *((1, 0, 0) if self.timed else ()), *[0] * self.own]
         last, table = len(self._kinds) - 1, self._kinds[-1].table
 
