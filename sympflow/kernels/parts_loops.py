@@ -6,7 +6,7 @@ modes and what is made of these alone; then of a driven system when the map acts
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import cache, cached_property, lru_cache, partial
 from itertools import pairwise
@@ -87,7 +87,6 @@ class PartMaps:
         self.parts, self.scales, self.ndof, self.filters = parts, scales, parts.ndof, filters
         self.lettered = [SymbolicLetters(part, [part.H]) for part in parts.rest]
         self.codes: dict[tuple[tuple[int, ...], ...], PartsCode] = {}
-        self._arranged: dict[int, Arranged] = {}
 
     @kept
     def arranged(self, code: int) -> Arranged:
@@ -286,7 +285,6 @@ class PartsLoops:
         self.parts, self.driven = parts, parts.driven
         self._scales = Scales(parts)
         self._of(())  # which says what has no compiled form
-        self._maps(False)  # which refuses what has no compiled form
         self._tables: dict[int, tuple[Sequence[SubFlow], _Table]] = {}
 
     def kernel(self, maps: Maps) -> PartsKernel:
@@ -381,22 +379,12 @@ class PartsLoops:
         if key not in maps.codes:
             maps.codes[key] = PartsCode(maps, key)
         return maps.codes[key]
-        return self._maps(any(m.filters is not None for m in sequence))
-
-    @kept
-    def _maps(self, filters: bool) -> PartMaps:
-        return PartMaps(self.parts, filters)
-
-    @kept
-    def _code(self, maps: PartMaps, groups: frozenset[tuple[int, ...]]) -> PartsCode:
-        return PartsCode(maps, sorted(groups))
 
     def _singles(self, maps: PartMaps) -> PartsCode:
         """The code of one map a column."""
         numbers = range(1, len(self.parts.rest) + 1)
         bent = [WITH_GRADIENT + k for k in numbers if self.parts.has_force_gradient]
-        alone = (IDLE, *([LINEAR] if self.parts.linear else []), *numbers, *bent)
-        return self._code(maps, frozenset((k,) for k in alone))
+        return self._code(maps, [(k,) for k in (IDLE, *([LINEAR] if self.parts.linear else []), *numbers, *bent)])
 
     def table(self, sequence: Sequence[SubFlow], n: int, maps: PartMaps) -> tuple[np.ndarray, np.ndarray]:
         """Codes (m,) and numbers (n, m, size), those of the time, of a driven system, still 0: see `timed`."""
@@ -457,7 +445,7 @@ class PartsLoops:
         for size in range(len(rest) + 1, 0, -1):
             head, inner = rest[: size - 1], [rest[i : i + size] for i in range(size - 1, len(rest), size)]
             groups = [[first, *head], *inner, [link, *head], [closing]]
-            kinds = frozenset(tuple(map(_code_of, group)) for group in groups)
+            kinds = {tuple(map(_code_of, group)) for group in groups}
             if sum(of.operations(k) for kind in kinds for k in kind) <= MOST_OPERATIONS:
                 break
         maps = [m for group in groups for m in group]
