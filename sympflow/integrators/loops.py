@@ -24,25 +24,17 @@ def stepper_of(
     """Return the stepper of the loops that `make` gives, for names of parameters where gradients flow to these."""
     if problem.followed:
         return with_loops(integrator, problem, arrays, _followed_loops(make, problem))
+    if is_tensor(problem.y0) and problem.system.followed_mass is not None:
+        try:
+            by_mass = _by_mass(problem)
+            return with_loops(integrator, by_mass, arrays, _loops_by_values(make, by_mass, problem.system.definition))
+        except NotCompiled:
+            pass
     told: list[str] = []
     kernel = compiled_loops(make, problem.y0, problem.backend, compensated, told, problem.system)
     if problem.parameter_values is not None:
         kernel = kernel.varied(problem.parameter_values)
     return with_loops(integrator, problem, arrays, kernel, told)
-
-
-def stepper_by_mass(
-    integrator: Any, problem: Problem, arrays: ArraySteps, make: Callable[[tuple[str, ...]], Any]
-) -> Stepper | None:
-    """Return the stepper of the loops of a system whose mass torch follows, if there are such loops."""
-    if problem.followed or not is_tensor(problem.y0) or problem.system.followed_mass is None:
-        return None
-    try:
-        by_mass = _by_mass(problem)
-        loops = _loops_by_values(make, by_mass, problem.system.definition)
-    except NotCompiled:
-        return None
-    return with_loops(integrator, by_mass, arrays, loops)
 
 
 def with_loops(

@@ -26,13 +26,14 @@ from sympflow.integrators.contract import (
     method_class,
 )
 from sympflow.integrators.interpolants import Mapped
-from sympflow.integrators.loops import compiled_loops, stepper_by_mass, stepper_of
+from sympflow.integrators.loops import compiled_loops, stepper_of
 from sympflow.integrators.methods import NAMES, TRIPLES
 from sympflow.integrators.steppers import Stepper
 from sympflow.lazy import Made
 from sympflow.schemes import CORRECTORS, POLYNOMIAL, SCHEMES, Scheme, checked_scheme, scheme_evaluations, scheme_named
 
 if TYPE_CHECKING:
+    from sympflow.kernels.protocol import Kernel
     from sympflow.kernels.tangents import TangentKernel
     from sympflow.storage.runs import RunStore
 
@@ -358,11 +359,11 @@ class Splitting(FixedStep):
 
     def own_stepper(self, problem: Problem) -> Stepper:
         composition, compensated = self.composed(problem.system), bool(self.compensated)
-        by_mass = stepper_by_mass(self, problem, composition, partial(composition.kernel_by, compensated))
-        if by_mass is not None:
-            return by_mass
-        make = composition.kernel_by if problem.followed else composition.kernel
-        return stepper_of(self, problem, composition, partial(make, compensated), compensated)
+
+        def make(names: tuple[str, ...] = ()) -> Kernel:
+            return composition.kernel_by(compensated, names) if names else composition.kernel(compensated)
+
+        return stepper_of(self, problem, composition, make, compensated)
 
     def run(self, problem: Problem) -> Outcome:
         if not self.keeps:

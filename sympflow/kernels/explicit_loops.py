@@ -14,7 +14,16 @@ from sympflow.compiler.control import DOUBLE, POINTER, Rows, Value
 from sympflow.compiler.program import Program, gradient
 from sympflow.hamiltonian.formulas import Variable, recorded
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.kernels.one_steps import OneStep, OneStepKernel, is_large, lettered, parametric, shared_code, terms_of
+from sympflow.kernels.one_steps import (
+    OneStep,
+    OneStepKernel,
+    is_large,
+    lettered,
+    parametric,
+    shared_code,
+    spelled,
+    terms_of,
+)
 from sympflow.kernels.runs import Numbers, Room, begun, finished
 from sympflow.lazy import kept
 
@@ -52,7 +61,7 @@ class Field:
     """J∇H less Γp plus a force by symbols, as code; if `large` by loops over terms, which read `data`, then Γ."""
 
     def __init__(self, system: HamiltonianSystem, names: tuple[str, ...] = ()) -> None:
-        symbols, force = system.spelled, system.external_force
+        symbols, force = spelled(system, names), system.external_force
         assert symbols is not None
         forces = () if force is None else force.expressions
         if force is not None and not (forces and system.symbols):

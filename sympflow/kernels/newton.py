@@ -23,7 +23,16 @@ from sympflow.compiler.program import Program, gradient, traced
 from sympflow.hamiltonian.collocation import MOST_ITERATIONS, Tableau, stage_nodes
 from sympflow.hamiltonian.formulas import recorded
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.kernels.one_steps import Lettered, OneStep, OneStepKernel, is_large, parametric, shared_code, terms_of
+from sympflow.kernels.one_steps import (
+    Lettered,
+    OneStep,
+    OneStepKernel,
+    is_large,
+    parametric,
+    shared_code,
+    spelled,
+    terms_of,
+)
 from sympflow.kernels.one_steps import lettered as with_letters
 from sympflow.kernels.rollouts import Rollouts
 from sympflow.kernels.runs import Numbers, Room, Values
@@ -48,7 +57,7 @@ def implicit_kernel(
     system: HamiltonianSystem, tableau: Tableau, compensated: bool = False, names: tuple[str, ...] = ()
 ) -> OneStepKernel:
     """The compiled loops of a method, with parameters of these names as numbers of columns, or a NotCompiled."""
-    written = system.spelled
+    written = spelled(system, names)
     if written is None:
         raise NotCompiled(
             "`system` cannot be compiled: its Hessian is not symbolic. Use HamiltonianSystem.from_sympy, "
@@ -58,6 +67,8 @@ def implicit_kernel(
     friction.check_sums(compensated)
     if friction.kind == 2:
         raise NotCompiled("`damping` is a matrix, whose decay is not compiled here: use backend='array'.")
+    if names and written.time is not None:
+        raise NotCompiled("`system` depends on t: use a splitting method.")
     symbols = parametric(written, names)
     of_time = with_letters(symbols, [symbols.H])
 

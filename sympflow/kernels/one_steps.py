@@ -30,6 +30,7 @@ __all__ = [
     "lettered",
     "parametric",
     "shared_code",
+    "spelled",
     "terms_of",
 ]
 
@@ -57,10 +58,13 @@ def is_large(form: Any) -> bool:
     return is_large(form.structure)
 
 
+def spelled(system: Any, names: tuple[str, ...]) -> Any:
+    """The form of a system; that without the mass, whose entries are numbers, where torch follows it; or None."""
+    return system.spelled if system.followed_mass is None or not names else system.definition.form
+
+
 def parametric(form: Any, names: tuple[str, ...]) -> Any:
     """A form whose parameters are numbers of columns: those with these names, whatever their values, or as they may."""
-    if names and form.time is not None:
-        raise NotCompiled("`system` depends on t: use a splitting method.")
     if names:
         return form.named(names)
     return form if is_large(form) else form.parametric
