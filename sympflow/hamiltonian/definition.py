@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from math import inf
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -52,7 +53,8 @@ class Definition:
     loops: str = ""  # the compiled loops of a definition by one piece: see `sympflow.hamiltonian.local`
     leaps: bool = False  # bodies may meet, over which a step may leap: then there is `leapt`
     impulses: tuple[Any, ...] = ()  # DiracDelta in t: then there are `between_impulses` and `kicks`
-    form: Any = None  # the program of functions that could be traced: see `sympflow.hamiltonian.formulas`
+    form: Any = None  # what programs are recorded of: see `sympflow.hamiltonian.formulas`
+    samples: Mapping[str, Any] = MappingProxyType({})  # functions of t by samples, of symbols
     layered: Any = None  # V with layers whose weights torch follows: see `sympflow.hamiltonian.layered`
     untraced: str = ""  # the reason for which they could not, a clause, known after `form`
     given_functions: bool = False  # of Python, which are traced where that is possible

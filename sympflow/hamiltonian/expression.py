@@ -8,7 +8,6 @@
 from __future__ import annotations
 
 import ast
-import keyword
 import math
 import re
 import unicodedata
@@ -17,16 +16,14 @@ from typing import Any
 
 import sympy as sp
 
+from sympflow.hamiltonian.grammar import COORDINATE, MAX_NESTING, Unreadable, chain, parsed
 from sympflow.hamiltonian.removable import BOUNDED, Max, Min, with_own_functions
 
-MAX_TEXT = 100_000  # characters
-MAX_NESTING = 100  # brackets and powers in each other
 MAX_EXPONENT = 1000.0  # of a power, where it is a number
 MAX_BITS = 4096  # of an exact fraction; a longer one is rounded
 MAX_TERMS = 50_000  # that the expression may have when it is multiplied out
 MAX_ARGUMENT = 1e4  # of a special function of numbers
 MAX_ARGUMENTS = 128
-TERMS_IN_A_ROW = 200
 
 # fmt: off
 ELEMENTARY = (
@@ -56,30 +53,10 @@ CONSTANTS = {"pi": sp.pi, "E": sp.E, "I": sp.I}
 RELATIONS = {ast.Lt: sp.Lt, ast.LtE: sp.Le, ast.Gt: sp.Gt, ast.GtE: sp.Ge}
 
 
-class Unreadable(ValueError):
-    """Refusal of a text, with the reason as a clause."""
-
-
 def read(text: str, names: Collection[str] = ()) -> sp.Expr:
     """The expression that a text states."""
-    if len(text) > MAX_TEXT:
-        raise Unreadable(
-            f"it has {len(text):,} characters, more than {MAX_TEXT:,}: a system that large is better given by one site "
-            "and one bond, HamiltonianSystem.lattice, by one pair, HamiltonianSystem.pairs, or by Numba functions, "
-            "HamiltonianSystem(V, ndof=…, gradient=…)"
-        )
-    _check_characters(text)
-    try:
-        tree = ast.parse(_grouped(" ".join(text.replace("^", "**").split())), mode="eval").body
-    except (SyntaxError, ValueError) as error:
-        raise Unreadable(_remedy(text) or getattr(error, "msg", None) or str(error)) from None
-    except (RecursionError, MemoryError):
-        raise Unreadable("it is nested too deeply") from None
-    value, _ = _Reader(_spelled(names)).visit(tree, 0)
+    value, _ = _Reader(_spelled(names)).visit(parsed(text, FUNCTIONS), 0)
     return value
-
-
-COORDINATE = re.compile(r"[qp]([1-9][0-9]{0,15})?")
 
 
 def stated(
@@ -139,69 +116,6 @@ def _spelled(names: Collection[str]) -> dict[str, str]:
     return {unicodedata.normalize("NFKC", name): name for name in names}
 
 
-def _check_characters(text: str) -> None:
-    """Before Python's parser sees the text, which warns of calls of numbers and gives up on deep nesting."""
-    if "#" in text:
-        raise Unreadable("it holds a #, which would hide all that follows: leave comments out")
-    depth = 0
-    for character in text:
-        depth += (character in "([{") - (character in ")]}")
-        if depth > MAX_NESTING:
-            raise Unreadable(f"it is nested more than {MAX_NESTING} deep")
-
-
-def _remedy(text: str) -> str | None:
-    """The text to write in place of one that is not Python."""
-    if found := re.search(r"(?<![\w.])(\d+\.?\d*)([A-Za-z(]\w*)", text):
-        return f"{found[0]} lacks a sign: write {found[1]}*{found[2]}"
-    if found := re.search(r"[²³⁴½¼√·×÷−π]", text):
-        return f"{found[0]} is not understood: write q**2, sqrt(q), *, /, - and pi"
-    if found := re.match(r"\s*[A-Za-z]\w*\s*(\([^)]*\)\s*)?=(?!=)", text):
-        return f"leave {found[0].strip()!r} out: only what stands after it is H"
-    if "|" in text:
-        return "| is not understood: write abs(q)"
-    if words := [word for word in re.findall(r"[A-Za-z_]\w*", text) if keyword.iskeyword(word)]:
-        return f"{words[0]} is a word of Python: choose another name, such as {words[0]}_"
-    if found := re.search(r"\b([A-Za-z]\w*) +([A-Za-z]\w*)", text):
-        lacks, written = "a sign", f"{found[1]}*{found[2]}"
-        if found[1] in FUNCTIONS:
-            lacks, written = "brackets", f"{found[1]}({found[2]})"
-        return f"{found[0]} lacks {lacks}: write {written}"
-    return None
-
-
-_TOKEN = re.compile(r"\s*(\.?\d[\w.]*(?:(?<=[eE])[+-]\d+)?|[^\W\d]\w*|\*\*|//|<<|>>|[<>=!]=|.)")
-
-
-def _grouped(text: str) -> str:
-    """The text, its long sums in brackets of `TERMS_IN_A_ROW` each, for a sum is nested as deep as it has terms."""
-    if text.count("+") + text.count("-") <= TERMS_IN_A_ROW:
-        return text
-    written: list[str] = []
-    counts, opened, last = [0], [False], "("
-    for token in _TOKEN.findall(text):
-        ends_sum = token in (*")]},<>", "<=", ">=", "==", "!=")
-        if ends_sum and opened[-1]:
-            written.append(")")
-            opened[-1] = False
-        if ends_sum:
-            counts[-1] = 0
-        if token in "([{":
-            counts.append(0)
-            opened.append(False)
-        elif token in ")]}" and len(counts) > 1:
-            counts.pop()
-            opened.pop()
-        elif token in "+-" and (last in ")]}" or last[-1].isalnum() or last[-1] in "_."):
-            counts[-1] += 1
-            if counts[-1] % TERMS_IN_A_ROW == 0:
-                written.append(")+(" if opened[-1] else "+(")
-                opened[-1] = True
-        written.append(token)
-        last = token
-    return " ".join(written) + ")" * opened[0]
-
-
 class _Reader:
     """Each method returns a value and the number of terms that it has when multiplied out."""
 
@@ -237,17 +151,9 @@ class _Reader:
             return CONSTANTS[name]
         return sp.Symbol(self.names.get(name, name), real=True)
 
-    def _chain(self, node: ast.AST, operators: tuple[type, type]) -> list[tuple[ast.AST, bool]]:
-        """The members of a + b − c … or a * b / c …, and whether each is the second kind; without recursion."""
-        members = []
-        while isinstance(node, ast.BinOp) and isinstance(node.op, operators):
-            members.append((node.right, isinstance(node.op, operators[1])))
-            node = node.left
-        return [(node, False), *reversed(members)]
-
     def _sum(self, node: ast.AST, depth: int) -> tuple[sp.Expr, int]:
         values, terms = [], 0
-        for member, minus in self._chain(node, (ast.Add, ast.Sub)):
+        for member, minus in chain(node, (ast.Add, ast.Sub)):
             value, n = self.visit(member, depth)
             values.append(-value if minus else value)
             terms = _few(terms + n)
@@ -255,7 +161,7 @@ class _Reader:
 
     def _product(self, node: ast.AST, depth: int) -> tuple[sp.Expr, int]:
         value, terms = sp.S.One, 1
-        for member, divide in self._chain(node, (ast.Mult, ast.Div)):
+        for member, divide in chain(node, (ast.Mult, ast.Div)):
             factor, n = self.visit(member, depth)
             if divide and factor.is_zero:
                 raise Unreadable("it divides by zero")

@@ -170,7 +170,7 @@ class Identity:
 
 @lately_kept
 def _agrees(system: Hamiltonian, identity: Identity) -> bool:
-    return identity.is_proved(system) or identity.first_difference(system) is None
+    return identity.first_difference(system) is None or identity.is_proved(system)
 
 
 @lately_kept
@@ -204,7 +204,7 @@ def _floats(values: Any, ndim: int) -> np.ndarray:
 
 def _energies(system: Hamiltonian, states: np.ndarray) -> np.ndarray:
     """H at the states (n, 2d), of a driven system each at a time that its number gives, within samples."""
-    low, high = (system.symbols and system.symbols.span) or (0.0, LATEST)
+    low, high = (system.symbols.span if system.definition.samples else None) or (0.0, LATEST)
     times = low + (high - low) * (np.arange(1, len(states) + 1) * GOLDEN % 1.0)
     with np.errstate(all="ignore"):
         return to_numpy(system.hamiltonian(states, times)).astype(float)

@@ -116,8 +116,9 @@ class TracedHamiltonian:
         inverse_mass: np.ndarray | None = None,
         timed: bool = False,
         kinetic: Program | None = None,
+        text: str | None = None,
     ) -> None:
-        self.ndof, self.program, self.separable, self._timed = ndof, program, separable, timed
+        self.ndof, self.program, self.separable, self._timed, self.text = ndof, program, separable, timed, text
         self.q = tuple(Variable(f"q{i + 1}") for i in range(ndof))
         self.p = tuple(Variable(f"p{i + 1}") for i in range(ndof))
         self.time = Variable("t") if timed else None
@@ -186,12 +187,14 @@ class TracedHamiltonian:
 
     @cached_property
     def written(self) -> SymbolicHamiltonian | None:
-        """The same in symbols, for methods that look for parts of H; None of a long one."""
-        if len(self.H) > MOST_IN_SYMBOLS:
+        """The same in symbols, of the text if H is one, for methods that look for parts of H; None of a long one."""
+        if self.text is None and len(self.H) > MOST_IN_SYMBOLS:
             return None
         from sympflow.hamiltonian.recorded import NotRecorded, in_symbols
         from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 
+        if self.text is not None:
+            return SymbolicHamiltonian(self.text)
         try:
             symbols = SymbolicHamiltonian(in_symbols(self.H.program), time="t" if self.time else None)
         except (NotRecorded, ValueError, TypeError):

@@ -92,7 +92,6 @@ class Hamiltonian:
     def __init__(self, name: str, definition: Any, inverse_mass: np.ndarray | None, quadratic_kinetic: bool) -> None:
         self._name = name
         self.definition = definition
-        self.symbols: Any = definition.symbols
         self.local: LocalHamiltonian | None = definition if definition.loops else None
         """The definition by one piece, of a lattice or of pairs, with what it has of its own, such as `shape`."""
         self.ndof: int = definition.ndof
@@ -105,6 +104,11 @@ class Hamiltonian:
         self.functions_given: bool = definition.given
         self.numba_functions: Any = definition.numba_functions
         self._tested: dict[tuple[type, Any], np.ndarray] = {}  # how far, by the kind of states
+
+    @property
+    def symbols(self) -> Any:
+        """The symbolic definition, made when it is first asked for, of H as text or SymPy's; else None."""
+        return self.definition.symbols
 
     @property
     def autonomous(self) -> bool:
@@ -229,7 +233,7 @@ class Hamiltonian:
     def identity_parts(self) -> Any:
         """Return all that H and the equations of motion are made of; a store recognises the system by it."""
         return [
-            self.definition,
+            self.definition if self.symbols is None else self.symbols,
             self.inverse_mass,
             self.stiffness_matrix,
             self.damping,
@@ -318,7 +322,7 @@ class Hamiltonian:
 
     def check_times(self, t0: float, t1: float) -> None:
         """Refuse an interval that leaves the times of sampled parameters, by a ValueError with these."""
-        if self.symbols is not None and self.symbols.samples:
+        if self.definition.samples:
             self.symbols.check_times(t0, t1)
 
     def _time(self, t: Any, x: Array) -> tuple[Any, ...]:
@@ -502,7 +506,7 @@ class Hamiltonian:
         """The definition that programs are recorded of: symbols, or functions that were traced; else None."""
         if self.followed_mass is not None:  # which is a number in programs
             return None
-        return self.symbols if self.symbols is not None else self.definition.form
+        return self.definition.form
 
     @property
     def layered(self) -> LayeredPotential | None:

@@ -275,6 +275,10 @@ class SymbolicHamiltonian(Definition):
         return self
 
     @property
+    def form(self) -> SymbolicHamiltonian:
+        return self
+
+    @property
     def structure(self) -> SymbolicHamiltonian:
         """H with the values with which it was first given: whatever does not depend on these is found from it."""
         return self

@@ -363,6 +363,13 @@ class HamiltonianSystem(Hamiltonian, Answering):
             impulses DiracDelta(t − a)·W(q), which are kicks p −= ∇W(q) at the time a; if `damping` is not symmetric,
             has negative rates, or another shape.
         """
+        if isinstance(expression, str) and all(given is None for given in (q, p, params, time)):
+            from sympflow.hamiltonian.written import written
+
+            if (found := written(expression)) is not None:
+                self = cls.__new__(cls)
+                self._make(*found, True, {}, Scene.given(scene), damping, period)
+                return self
         from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, checked_params, renamed
 
         if q is not None or p is not None:

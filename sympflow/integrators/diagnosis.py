@@ -16,6 +16,7 @@ import numpy as np
 
 from sympflow.arguments import warn
 from sympflow.arrays import Array, masked, readable, to_numpy
+from sympflow.hamiltonian.formulas import TracedHamiltonian
 from sympflow.hamiltonian.scales import known_scale, rate_of_motion
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep
@@ -202,7 +203,7 @@ def warn_of_collision(outcome: Outcome, integrator: Integrator, problem: Problem
         sizes, strengths = np.abs(p).max(1, keepdims=True), np.abs(force).max(1, keepdims=True)
         share = np.where(sizes > 0, NUDGE * sizes, 1.0) / np.maximum(strengths, 1e-300)
         falling = np.concatenate([y0[:, :d], p + share * force], axis=1)  # of what is at rest, as it begins to move
-        if system.symbols is None and system.local is None:  # whose places are written in symbols for that
+        if isinstance(system.form, TracedHamiltonian):  # whose places are written in symbols for that
             v, a = (np.asarray(system.gradient(np.concatenate([y0[:, :d], x], axis=1)))[:, d:] for x in (p, force))
             if ((v * a).sum(1) ** 2 < STRAIGHT * (v * v).sum(1) * (a * a).sum(1)).all():
                 return False

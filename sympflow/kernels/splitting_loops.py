@@ -58,14 +58,16 @@ class SplittingLoops:
     """
 
     def __init__(self, system: HamiltonianSystem, names: tuple[str, ...] = ()) -> None:
-        symbols = system.symbols.named(names) if names and system.symbols is not None else system.symbols
+        symbols: Any = None if isinstance(system.form, TracedHamiltonian) else system.form
+        if names and symbols is not None:
+            symbols = symbols.named(names)
         if system.local is not None and system.local.in_terms and not system.local.arrays_only:
             symbols = system.local.spelled
         self.ndof, self.friction = system.ndof, system.friction
         self.values: tuple[float, ...] = ()
         self.work = system.ndof if system.local is None else system.local.work
         self._has_ranges = self.traced = self._large = False
-        self._form: Any = system.form if symbols is system.symbols else symbols
+        self._form: Any = system.form if symbols is None else symbols
         self._driving: Driving | TracedDriving | None = None
         self._written: Callable[..., Splitting] | None = None
         self._compile: Callable[..., SplittingRollouts]
@@ -106,6 +108,7 @@ class SplittingLoops:
             self._has_force_gradient = self.traced = True
             self._form, self.values, V = form, form.values, form.V
             self.abreast = LANES_OF_SUMS if V is not None and V.is_polynomial() and not self.driven else LANES
+            self._has_ranges = form.text is not None and self.ndof == 1 and not form.V.is_polynomial()
             if self.driven:
                 driving = self._driving = form.driving
                 self._form = driving.form
@@ -223,7 +226,8 @@ class SplittingLoops:
         ndim, driving = self.friction.kind, self._driving
         if self._written is not None:
             return self._written(level, monomials, compensated, ndim)
-        symbols = self._form.parametric if parametric and driving is None and not ranges else self._form
+        form = self._form.written if ranges and isinstance(self._form, TracedHamiltonian) else self._form
+        symbols = form.parametric if parametric and driving is None and not ranges else form
         return Splitting(symbols, level, monomials, compensated, ndim, driving, ranges)
 
     def kick_cycles(self, level: int, ranges: Ranges = ()) -> float:
@@ -241,7 +245,7 @@ class SplittingLoops:
     @cached_property
     def _ranges(self) -> Ranges:
         system = None if self._system is None else self._system()
-        if not self._has_ranges or system is None or system.symbols is None or system.domain is None:
+        if not self._has_ranges or system is None or system.domain is None:
             return ()
         from sympflow.kernels.approximations import position_ranges
 

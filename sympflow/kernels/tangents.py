@@ -18,7 +18,7 @@ from sympflow.compiler.arrange import Arranged
 from sympflow.compiler.control import INT, Value
 from sympflow.compiler.functions import dot, summed
 from sympflow.compiler.program import Program, derivatives, gradient, traced
-from sympflow.hamiltonian.formulas import evaluator
+from sympflow.hamiltonian.formulas import TracedHamiltonian, evaluator
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.protocol import Batch, RunCheckpoint, Task, run_states
@@ -291,7 +291,7 @@ def tangent_code(system: HamiltonianSystem, level: int, monomials: Monomials, ve
 @kept
 def _lacks(system: HamiltonianSystem) -> str:
     """The reason why a system has no compiled vectors, "" if it has."""
-    if system.symbols is None:
+    if system.form is None or isinstance(system.form, TracedHamiltonian):
         given = system.local is not None or system.form is not None
     else:
         from sympflow.kernels.terms import is_long
