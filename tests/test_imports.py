@@ -15,14 +15,21 @@ ALLOWED = [
     "system = sympflow.HamiltonianSystem(lambda q: np.cos(q).sum(-1), ndof=2, y0=[0.1, 0.2, 0.3, 0.4])\n"
     "for method in ('verlet', 'srkn11b', 'gauss_legendre4', 'rk4'):\n"
     "    assert sympflow.solve(system, method, (0, 1), dt=0.1).stats['backend'] == 'compiled'",
-    "import sympflow; sympflow.systems.henon_heiles().force",
     "import sympflow\n"
-    "for backend in 'auto', 'array':\n"
-    "    sympflow.solve(sympflow.systems.henon_heiles(), 'verlet', (0, 1), backend=backend).energy()\n"
+    "for H in 'p**2/2 + q**2/2 + q**4/4', 'p**2/2 + exp(-2*q) - 2*exp(-q)', 'p**2/2 - cos(q)/3 + sqrt(1 + q**2)':\n"
+    "    system = sympflow.HamiltonianSystem.from_sympy(H, y0=[0.5, 0.0])\n"
+    "    assert sympflow.solve(system, 'verlet', (0, 1), dt=0.1).stats['backend'] == 'compiled'\n"
+    "for scene in sympflow.systems.pendulum, sympflow.systems.kepler, sympflow.systems.henon_heiles:\n"
+    "    for method in 'srkn11b', 'gauss_legendre4', 'rk4', 'verlet':\n"
+    "        assert sympflow.solve(scene(), method, (0, 1), dt=0.1).stats['backend'] == 'compiled'\n"
+    "    sympflow.solve(scene(), 'verlet', (0, 1), backend='array').energy()\n"
+    "    assert scene().hessian(scene().y0) is not None",
+    "import sympflow; sympflow.systems.henon_heiles().expression",
+    "import sympflow\n"
     "sympflow.available(); sympflow.shipped_flows()",
     "import sympflow; sympflow.solve(sympflow.systems.pendulum(), 'rk45', (0, 1))",
 ]
-"""Code, of which the third needs SymPy and the last SciPy, and none anything else."""
+"""Code, of which the fourth needs SymPy and the last SciPy, and none anything else."""
 
 COMPILED = [
     "sympflow.lyapunov(sympflow.systems.henon_heiles(), 'verlet', (0, 1), dt=0.1, backend='compiled')",
@@ -59,7 +66,7 @@ def loaded_after(*codes: str) -> dict[str, str]:
 
 def test_a_call_loads_what_it_needs():
     loaded = loaded_after(*ALLOWED)
-    assert loaded == {"sympy": ALLOWED[2], "scipy": ALLOWED[-1], "numpy.f2py": ALLOWED[-1]}  # by SciPy
+    assert loaded == {"sympy": ALLOWED[3], "scipy": ALLOWED[-1], "numpy.f2py": ALLOWED[-1]}  # by SciPy
 
 
 def test_neither_compiled_runs_nor_flows_that_ship_load_numba_or_torch():

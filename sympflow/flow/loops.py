@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike
 from sympflow.compiler import arrays_only
 from sympflow.flow.tables import Tables
 from sympflow.hamiltonian.collocation import Tableau
-from sympflow.hamiltonian.parts import ExactParts
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.protocol import Kernel, Run, RunCheckpoint, Steps, Task, begun_in, both_ways, run_states
 from sympflow.kernels.splitting_loops import SplittingKernel, splitting_loops
@@ -21,6 +20,7 @@ from sympflow.kernels.stages import StageTable, run_table, single_table, with_la
 from sympflow.schemes import CURVATURE, Scheme
 
 if TYPE_CHECKING:
+    from sympflow.hamiltonian.parts import ExactParts
     from sympflow.kernels.reverse import Between, Recorded
     from sympflow.kernels.rollouts import SplittingRollouts
 

@@ -54,6 +54,7 @@ class Definition:
     leaps: bool = False  # bodies may meet, over which a step may leap: then there is `leapt`
     impulses: tuple[Any, ...] = ()  # DiracDelta in t: then there are `between_impulses` and `kicks`
     form: Any = None  # what programs are recorded of: see `sympflow.hamiltonian.formulas`
+    text: str | None = None  # H, where that is a text, or an expression in symbols
     samples: Mapping[str, Any] = MappingProxyType({})  # functions of t by samples, of symbols
     layered: Any = None  # V with layers whose weights torch follows: see `sympflow.hamiltonian.layered`
     untraced: str = ""  # the reason for which they could not, a clause, known after `form`

@@ -428,7 +428,7 @@ class SymbolicHamiltonian(Definition):
         return self._function("drift'", lambda: list(sp.Matrix(self.drift).jacobian(self.p)), _square)(p, t, s)
 
     @property
-    def text(self) -> str:
+    def text(self) -> str:  # type: ignore[override]
         """H, whatever the name of the time in t."""
         return str(self.H if self.time is None else self.H.xreplace({self.time: sp.Symbol("t", real=True)}))
 

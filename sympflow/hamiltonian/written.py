@@ -149,14 +149,14 @@ class WrittenHamiltonian(Definition):
     separable = has_third_derivative = True
 
     def __init__(self, form: TracedHamiltonian) -> None:
-        self.form, self.ndof = form, form.ndof
+        self.form, self.ndof, self.text = form, form.ndof, form.text
 
     @property
     def name(self) -> str:
         return self.symbols.name
 
     @property
-    def symbols(self) -> Any:  # type: ignore[override]
+    def symbols(self) -> Any:
         return self.form.written
 
     @cached_property

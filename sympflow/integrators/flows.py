@@ -59,7 +59,7 @@ def known(key: tuple[Any, ...], make: Callable[[], T]) -> T:
 @kept
 def kind_of(system: HamiltonianSystem) -> tuple[Any, ...]:
     """The formula and the flows that systems share for which the same flows are kept."""
-    return system.fingerprint, system.expression, tuple(f.name for f in shipped_flows(system))
+    return system.fingerprint, system.definition.text, tuple(f.name for f in shipped_flows(system))
 
 
 @kept

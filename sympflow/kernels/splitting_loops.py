@@ -226,7 +226,7 @@ class SplittingLoops:
         ndim, driving = self.friction.kind, self._driving
         if self._written is not None:
             return self._written(level, monomials, compensated, ndim)
-        form = self._form.written if ranges and isinstance(self._form, TracedHamiltonian) else self._form
+        form: Any = self._form.written if ranges and isinstance(self._form, TracedHamiltonian) else self._form
         symbols = form.parametric if parametric and driving is None and not ranges else form
         return Splitting(symbols, level, monomials, compensated, ndim, driving, ranges)
 

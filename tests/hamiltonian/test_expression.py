@@ -13,7 +13,8 @@ from watchdog import watched
 
 from sympflow import HamiltonianSystem, SympFlow, load, solve, systems
 from sympflow.flow.records import KEY, SUM, text_checksum
-from sympflow.hamiltonian.expression import Unreadable, read
+from sympflow.hamiltonian.expression import read
+from sympflow.hamiltonian.grammar import Unreadable
 from sympflow.hamiltonian.removable import Max, sinc
 
 q, p, q1, q2 = sp.symbols("q p q1 q2", real=True)
@@ -162,7 +163,7 @@ def test_sums_of_thousands_of_terms_are_read():
 )
 def test_sums_are_the_same_however_they_are_grouped(text, monkeypatch):
     expected = read(text)
-    monkeypatch.setattr("sympflow.hamiltonian.expression.TERMS_IN_A_ROW", 1)
+    monkeypatch.setattr("sympflow.hamiltonian.grammar.TERMS_IN_A_ROW", 1)
     assert sp.expand(read(text) - expected) == 0
 
 
