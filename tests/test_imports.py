@@ -25,8 +25,7 @@ ALLOWED = [
     "    sympflow.solve(scene(), 'verlet', (0, 1), backend='array').energy()\n"
     "    assert scene().hessian(scene().y0) is not None",
     "import sympflow; sympflow.systems.henon_heiles().expression",
-    "import sympflow\n"
-    "sympflow.available(); sympflow.shipped_flows()",
+    "import sympflow\nsympflow.available(); sympflow.shipped_flows()",
     "import sympflow; sympflow.solve(sympflow.systems.pendulum(), 'rk45', (0, 1))",
 ]
 """Code, of which the fourth needs SymPy and the last SciPy, and none anything else."""

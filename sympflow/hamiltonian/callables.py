@@ -32,13 +32,18 @@ from sympflow.arrays import (
     unfollowed,
     values,
 )
-from sympflow.compiler.program import Program, derivatives, gradient, reached, traced
+from sympflow.compiler.program import Program, traced
 from sympflow.compiler.tracing import WEIGHTS, Untraceable, trace, trace_chain
 from sympflow.hamiltonian.definition import Definition
-from sympflow.hamiltonian.formulas import MOST_COMPILED, TracedHamiltonian, TracedPoles, without_overflow
+from sympflow.hamiltonian.formulas import (
+    MOST_COMPILED,
+    TracedHamiltonian,
+    TracedPoles,
+    kinetic_matrix,
+    without_overflow,
+)
 from sympflow.hamiltonian.function_checks import Tested, check_writes, probe_states, test
 from sympflow.hamiltonian.layered import LayeredPotential
-from sympflow.hamiltonian.linear_part import simplest
 from sympflow.hamiltonian.times import probe_times
 
 MOST_BY_ARRAYS = 2000  # operations of a gradient, beyond which torch differentiates its own functions of arrays
@@ -100,19 +105,17 @@ class CallableHamiltonian(Definition):
         if form is None or self.separable:
             return None
         H, inputs = form.program, form.program.inputs
-        slopes = gradient(H.outputs[0], inputs[-d:])
-        if {x.order for x in inputs[:-d]} & {x.order for x in reached(slopes)}:
+        is_sum, quadratic, inverse_mass = kinetic_matrix(H.outputs[0], inputs, d)
+        if not is_sum:
             return None
-        M, nothing = derivatives(slopes, inputs[-d:]), [0.0] * d
+        nothing = [0.0] * d
         state, t, _ = self._known
         elsewhere = [t] * self.timed + state[:d].tolist()
         p0 = nothing if np.isfinite(H(*map(np.float64, (*elsewhere, *nothing)))[0]) else state[d:].tolist()
         made = CallableHamiltonian(d, _AtRest(self._functions[1], p0), None, None, None, self.given, self.timed)
         made.guard = self.check_unchanged
-        if p0 is nothing and all(isinstance(x, float) for row in M for x in row):
-            moves = any(Program(inputs, slopes)(*elsewhere, *nothing))
-            if not moves and np.linalg.eigvalsh(M)[0] > 0:
-                return made, simplest(np.array(M)), True
+        if p0 is nothing and quadratic:
+            return made, inverse_mass, True
 
         def kinetic(*p: Any) -> list[Any]:
             return [H(*elsewhere, *p)[0] - H(*elsewhere, *p0)[0]]

@@ -18,7 +18,18 @@ import numpy as np
 
 from sympflow.arrays import Array, assemble, beside, is_tensor
 from sympflow.compiler.functions import apply, is_zero, where
-from sympflow.compiler.program import CONDITIONS, Program, Recording, Traced, gradient, tangent, traced
+from sympflow.compiler.program import (
+    CONDITIONS,
+    Program,
+    Recording,
+    Traced,
+    derivatives,
+    gradient,
+    reached,
+    tangent,
+    traced,
+)
+from sympflow.hamiltonian.linear_part import simplest
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.poles import Poles
@@ -325,7 +336,8 @@ class TracedPoles:
                     self._add(x)
             elif _least(g) < POSITIVE:
                 self._vanishing[g.order] = g
-                used = [x for x in self._form.H.program.inputs if x.order in _reached(g)]
+                within = {x.order for x in reached([g])}
+                used = [x for x in self._form.H.program.inputs if x.order in within]
                 if len(used) == 1 and g is not used[0]:
                     with np.errstate(all="ignore"):
                         at_zero = Program(used, [g])(np.float64(0.0))[0]
@@ -363,17 +375,6 @@ def _between_roots(g: Traced) -> tuple[Any, Any] | None:
     x, other = square.args
     is_square = other is x if square.name == "mul" else isinstance(other, float) and other == 2
     return (x - a, x + a) if is_square else None
-
-
-def _reached(g: Traced) -> set[int]:
-    """The numbers of the operations and inputs on which a traced number depends."""
-    found, left = set[int](), [g]
-    while left:
-        x = left.pop()
-        if x.order not in found:
-            found.add(x.order)
-            left += [a for a in x.args if isinstance(a, Traced)]
-    return found
 
 
 _TOUCHING = {"cos": (math.pi, 0.0), "sin": (math.pi / 2, -math.pi / 2), "cosh": (0.0, 0.0)}
@@ -503,6 +504,19 @@ def _kinetic(M: Sequence[Sequence[Any]], p: Sequence[Any]) -> Any:
             if not is_zero(entry):
                 total = total + (0.5 * entry) * (p[i] * p[j])
     return total
+
+
+def kinetic_matrix(H: Any, inputs: Sequence[Traced], d: int) -> tuple[bool, bool, np.ndarray | None]:
+    """True of a sum T(p) + V of the last d inputs and the others; True if T = ½ pᵀM⁻¹p; M⁻¹ in its simplest form."""
+    p = inputs[-d:]
+    velocity = gradient(H, p)
+    if {x.order for x in inputs[:-d]} & {x.order for x in reached(velocity)}:
+        return False, False, None
+    M: Any = derivatives(velocity, p)
+    is_constant = all(isinstance(x, float) for row in M for x in row)
+    if not is_constant or any(Program(p, velocity)(*[0.0] * d)) or not np.linalg.eigvalsh(M)[0] > 0:
+        return True, False, None
+    return True, True, simplest(np.array(M))
 
 
 def evaluator(numbers: Mapping[Any, Any]) -> Callable[[Any], Any]:

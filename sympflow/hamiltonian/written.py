@@ -14,11 +14,10 @@ import numpy as np
 
 from sympflow.arrays import Array
 from sympflow.compiler.functions import apply
-from sympflow.compiler.program import Program, Recording, Traced, derivatives, gradient, reached, traced
+from sympflow.compiler.program import Program, Recording, Traced, gradient, reached, traced
 from sympflow.hamiltonian.definition import Definition
-from sympflow.hamiltonian.formulas import TracedHamiltonian, TracedPoles
+from sympflow.hamiltonian.formulas import TracedHamiltonian, TracedPoles, kinetic_matrix
 from sympflow.hamiltonian.grammar import COORDINATE, chain, parsed
-from sympflow.hamiltonian.linear_part import simplest
 
 FUNCTIONS = {name: name for name in ("sqrt", "exp", "log", "sin", "cos", "tan", "sinh", "cosh", "tanh", "atan")}
 FUNCTIONS["ln"] = "log"
@@ -124,23 +123,14 @@ def _form(text: str) -> tuple[TracedHamiltonian, np.ndarray | None]:
     inputs = [recording.input(f"{letter}{i + 1}") for letter in "qp" for i in range(d)]
     known = dict(zip(map(repr, inputs) if numbered else "qp", inputs, strict=True))
     H = _Reader(known).value(tree)
-    slopes = gradient(H, inputs)
-    if len(Program(inputs, slopes)) > MOST_OPERATIONS:
-        raise NotPlain
-    velocity, p = slopes[d:], inputs[d:]
-    M = derivatives(velocity, p)
-    if {x.order for x in inputs[:d]} & {x.order for x in reached(velocity)}:
+    _, quadratic, inverse_mass = kinetic_matrix(H, inputs, d)
+    if not quadratic or len(Program(inputs, gradient(H, inputs))) > MOST_OPERATIONS:
         raise NotPlain
     rest = [0.0] * d
-    if not all(isinstance(x, float) for row in M for x in row) or any(Program(p, velocity)(*rest)):
-        raise NotPlain
-    inverse = np.array(M)
-    if not (np.array_equal(inverse, inverse.T) and np.linalg.eigvalsh(inverse)[0] > 0):
-        raise NotPlain
     V = traced(lambda *q: Program(inputs, [H])(*q, *rest), *map(repr, inputs[:d]))
     if not isinstance(V.outputs[0], Traced):
         raise NotPlain
-    return TracedHamiltonian(d, V, True, simplest(inverse), text=text), simplest(inverse)
+    return TracedHamiltonian(d, V, True, inverse_mass, text=text), inverse_mass
 
 
 class WrittenHamiltonian(Definition):

@@ -61,11 +61,12 @@ class Field:
     """J∇H less Γp plus a force by symbols, as code; if `large` by loops over terms, which read `data`, then Γ."""
 
     def __init__(self, system: HamiltonianSystem, names: tuple[str, ...] = ()) -> None:
-        symbols, force = spelled(system, names), system.external_force
-        assert symbols is not None
+        force = system.external_force
+        symbols = spelled(system, names) if force is None else system.symbols
         forces = () if force is None else force.expressions
-        if force is not None and not (forces and system.symbols):
+        if force is not None and not (forces and symbols):
             raise NotCompiled("`system` has a force by a function, which is not compiled: use backend='array'.")
+        assert symbols is not None
         self.large = is_large(symbols) and force is None
         if force is not None and names:
             raise NotCompiled("`system` has a force that is none of H.")

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+import sympy as sp
 from scipy.integrate import solve_ivp
 
 from sympflow import HamiltonianSystem, solve
@@ -48,7 +49,10 @@ CASES = {  # a system, its rates, a method and its order, the longer of two step
         ("kahan_li8", 8, 0.25),
     ),
     "terms": (
-        of("(p1**2 + p2**2 + p3**2)/2 + (q1 - q2)**4/4 + (q2 - q3)**4/3 + q3**2", [0.3, -0.4, 0.5, 0.1, 0.2, -0.2]),
+        of(
+            sp.sympify("(p1**2 + p2**2 + p3**2)/2 + (q1 - q2)**4/4 + (q2 - q3)**4/3 + q3**2"),
+            [0.3, -0.4, 0.5, 0.1, 0.2, -0.2],
+        ),
         separable(
             lambda t, q: np.array(
                 [
