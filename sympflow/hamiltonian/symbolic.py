@@ -674,13 +674,18 @@ def parse(expression: str | sp.Expr, params: Mapping[str, Any], time: sp.Symbol 
     return _valued(*_read(expression, checked_params(params), time), time)
 
 
+TABULATED = "Give a potential by a function, HamiltonianSystem(lambda q: V(q[..., 0]), ndof=1)"
+
+
 def _read(
     expression: str | sp.Expr, params: Mapping[str, Any], time: sp.Symbol | None
 ) -> tuple[sp.Expr, dict[sp.Symbol, sp.Expr]]:
     """The expression in real symbols, and the numbers, or functions of t, for those that are parameters."""
     names = {name: sp.Symbol(name, real=True) for name in params}
     meant = {*params, *(() if time is None else (time.name,))}
-    H = stated("expression", expression, {*meant, *_AMBIGUOUS} if isinstance(expression, str) else meant)
+    known, given = {*meant, *_AMBIGUOUS} if isinstance(expression, str) else meant, params.values()
+    remedy = {"remedy": TABULATED} if any(isinstance(value, Samples) for value in given) else {}
+    H = stated("expression", expression, known, **remedy)
     _check_real(H)
     for name in params:
         if names[name] not in H.free_symbols:
@@ -747,8 +752,7 @@ def _check_samples(written: sp.Expr, values: Mapping[sp.Symbol, sp.Expr]) -> Non
         if isinstance(value, sampled) and all(term.free_symbols <= values.keys() for term in terms if term.has(symbol)):
             raise ValueError(
                 f"`params` has {symbol.name}, a spline, which is a function of the time: in a term without q and p it "
-                "moves nothing. Give a potential by a function, HamiltonianSystem(lambda q: V(q[..., 0]), ndof=1); "
-                "where it is the time that is meant, pass time='t'."
+                f"moves nothing. {TABULATED}; where it is the time that is meant, pass time='t'."
             )
 
 
