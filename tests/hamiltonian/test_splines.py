@@ -133,3 +133,8 @@ def test_programs_with_tables_can_be_pickled():
     q = np.linspace(-2.0, 2.0, 9)
     np.testing.assert_array_equal(program(q)[0], system.form.program(q)[0])
     assert str(program) == str(system.form.program)
+
+
+def test_a_spline_in_a_text_is_sent_to_functions():
+    with pytest.raises(ValueError, match=r"^`expression` cannot be parsed: .* Give a potential by a function, Ham"):
+        HamiltonianSystem.from_sympy("p**2/2 + V(q)", params={"V": cubic})
