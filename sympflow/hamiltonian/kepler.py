@@ -119,7 +119,9 @@ def coefficients(X: Any, G: Sequence[Any], r: Any, inverse: Any, eta: Any, zeta:
     end = slope * (1.0 - (slope * d) * (eta * G0 + zeta * G1))
     G1, G2, G3 = G1 + d * G0, G2 + d * G1, G3 + d * G2
     a = mu * G2
-    return [-(a * inverse), t - mu * G3, -(mu * G1 * inverse * end), -(a * end), d, r * G1 + eta * G2]
+    f, g, df = -(a * inverse), t - mu * G3, -(mu * G1 * inverse * end)
+    dg = where(f > -0.5, fma(g, df, -f) / (1.0 + f), -(a * end))  # fg′ − f′g = 1, without a bias of rounding
+    return [f, g, df, dg, d, r * G1 + eta * G2]
 
 
 def moved(x: Sequence[Any], v: Sequence[Any], c: Sequence[Any]) -> Numbers:
