@@ -16,17 +16,14 @@ if not BENCHMARKS.exists():
 sys.path.insert(0, str(BENCHMARKS))
 
 import again
-import drift
 import primed
 from contenders import loops, ours, tables
-from contenders.contender import Scene, Skipped, Work
-from contenders.measurement import Judged, Results, Row, check_agreement, goals, largest_control, measure
+from contenders.contender import Scene, Skipped
+from contenders.measurement import Results, Row, goals, measure
 from measuring import race as at_equal_error
 
-from sympflow import shipped_flows, systems
 from sympflow.schemes import SCHEMES
 from sympflow.systems import pendulum
-from sympflow.training.shipped.recipe import SCENES
 
 pytestmark = pytest.mark.slow
 
@@ -40,31 +37,10 @@ def row(package, label, seconds, trajectories=1, target=1e-6, control="dt"):
 # the step or tolerance for a target -------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("order", [1, 2, 6, 8])
-@pytest.mark.parametrize("guess", [1e-3, 0.4, 30.0])
-def test_largest_control_meets_the_target_closely_on_a_power_law(order, guess):
-    judged = largest_control(lambda x: Judged(x, x**order, None, Work(1, 1)), 1e-6, guess, order, 0.95)
-    assert 0.95e-6 <= judged.energy_error <= 1e-6
-
-
 # errors -----------------------------------------------------------------------------------------------
 
 
 # every loop takes the steps of our methods ------------------------------------------------------------
-
-
-@pytest.mark.parametrize("trajectories", [1, TINY.trajectories])
-def test_hand_written_and_interpreted_loops_take_our_steps(trajectories):
-    leader = next(c for c in ours.contenders(TINY) if c.label == "verlet" and c.trajectories == trajectories)
-    for contender in loops.contenders(TINY):
-        if contender.trajectories == trajectories:
-            check_agreement(TINY, contender, leader, 0.05)
-
-
-def test_a_loop_with_other_steps_is_found_out():
-    leader, other = (next(c for c in ours.contenders(TINY) if c.label == name) for name in ("verlet", "suzuki4"))
-    with pytest.raises(RuntimeError, match="suzuki4 differs from verlet"):
-        check_agreement(TINY, other, leader, 0.05)
 
 
 # targets and page -------------------------------------------------------------------------------------
@@ -152,13 +128,6 @@ def test_a_tiny_race_of_primed_flows(tmp_path, monkeypatch):
 
 
 # training, drift, planets -----------------------------------------------------------------------------
-
-
-def test_scenes_of_the_drift_are_those_of_all_flows():
-    """But of driven systems, whose energy is not kept and has no drift."""
-    scenes = [*drift.scenes(), systems.driven_pendulum(), SCENES["duffing"]()]
-    for entry in shipped_flows(kind="sympflow"):
-        assert any(entry.is_of(system) for system in scenes), entry.name
 
 
 # a third party's method both ways ----------------------------------------------------------------------

@@ -328,18 +328,6 @@ def test_solve_takes_a_tolerance():
     assert "`--tol` chooses the step of a method with fixed steps" in " ".join(refused.output.split())
 
 
-def test_solve_takes_a_formula_and_the_values_of_its_symbols():
-    formula = ("p**2/2 + k*q**4/4", "--k", 3)
-    result = run("solve", *formula, "--y0", "1,0", "--t-end", 5, "--methods", "srkn11b", "--tol", 1e-9)
-    assert result.exit_code == 0
-    assert float(re.search(r"largest energy error ([0-9.e-]+)", result.output)[1]) <= 1e-9
-    stiff = run("solve", "p**2/2 + 1e6*q**2/2 + .5e-3*q", "--y0", "1,0", "--t-end", "0.01")
-    assert stiff.exit_code == 0
-    missing = run("solve", "p**2/2 + k*q**4/4", "--y0", "1,0")
-    assert missing.exit_code == 2
-    assert "`--k` is missing" in missing.output
-
-
 ANSWERED = {
     "an option twice": (["solve", "pendulum", "--dt", "1", "--dt", "2"], "given 2 times: give it once"),
     "methods twice": (["compare", "pendulum", "--method", "rk4", "--method", "rk45"], "its values separated by"),

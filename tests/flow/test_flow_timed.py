@@ -43,6 +43,8 @@ def test_training_fits_it_at_all_times_of_the_drive(system, trained):
         truth = solve(system, "dop853", (t0, t0 + 1.2), x, rtol=1e-11, atol=1e-11).y[..., -1]
         still = np.abs(x - truth).max()
         assert np.abs(trained(1.2, torch.tensor(x), t0=t0).numpy() - truth).max() < still / 20
+    moved = trained.transferred(driven(a=0.2))
+    assert torch.equal(moved(1.2, torch.tensor(x), t0=0.2), trained(1.2, torch.tensor(x), t0=0.2))
     sol = solve(system, trained, (0.3, 8.3))
     assert sympflow.energy_balance_error(sol).max() < 0.05
     assert sympflow.symplecticity_defect(sol).max() < 1e-13

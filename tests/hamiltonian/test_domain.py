@@ -85,19 +85,6 @@ def test_a_tube_has_its_radius_in_each_coordinate():
     assert not tube.contains([[-0.51, 0.0], [0.5, 2.01], [1.51, 0.0]]).any()
 
 
-def test_the_groups_of_a_tube_have_times_of_their_own():
-    """Two bodies on the circle in step; in groups, at any two places of it."""
-    orbit = np.hstack([CIRCLE, CIRCLE])
-    opposite = np.array([1.0, 0.0, -1.0, 0.0])
-    assert not Tube(orbit, 0.1).contains(opposite)
-    groups = Tube(orbit, 0.1, groups=[[0, 1], [2, 3]])
-    assert groups.contains(opposite)
-    x = groups.sample(4000, 0)
-    phase = np.arctan2(x[:, [1, 3]], x[:, [0, 2]])
-    # independent and uniform: cos of the difference has mean 0 and variance 1/2
-    assert abs(np.cos(phase[:, 0] - phase[:, 1]).mean()) < 5 / math.sqrt(2 * 4000)
-
-
 def test_tube_samples_are_uniform_about_the_orbit():
     """About a segment, far from its ends: uniform in the disc of the section times the segment."""
     x = Tube([[0.0, 0.0], [1000.0, 0.0]], 1.0).sample(20_000, 0)

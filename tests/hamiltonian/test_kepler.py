@@ -3,9 +3,7 @@
 import mpmath as mp
 import numpy as np
 import pytest
-import torch
 
-from sympflow.arrays import jvp
 from sympflow.hamiltonian.kepler import elements_of, kepler_flow, states_of
 
 EPS = np.finfo(float).eps
@@ -70,19 +68,6 @@ def test_it_is_as_exact_as_its_conditioning_allows(e):
                 least = [max(a, size(y - z)) for a, y, z in zip(least, other, right, strict=True)]
             for a, b, bound in zip(found, right, least, strict=True):
                 assert size(a - b) < 100 * bound
-
-
-def test_the_derivative_of_tensors_is_that_of_the_flow():
-    x, v = torch.tensor([1.0, 0.1, 0.2]).double(), torch.tensor([0.1, 1.0, 0.2]).double()
-    mu, t = torch.tensor(1.0).double(), torch.tensor(0.7).double()
-
-    def end(y):
-        x, v = kepler_flow([*y[:3]], [*y[3:]], mu, t)
-        return torch.stack([*x, *v])
-
-    y, w, h = torch.cat([x, v]), torch.arange(6.0).double(), 1e-5
-    _, along = jvp(end, y, w)
-    assert np.allclose(along, (end(y + h * w) - end(y - h * w)) / (2 * h), atol=1e-7)
 
 
 def test_elements_and_states_are_each_others_inverse():

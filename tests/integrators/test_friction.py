@@ -46,20 +46,6 @@ def test_a_wrong_damping_is_refused(damping, error, says):
         HamiltonianSystem(lambda q: (q**2).sum(-1), ndof=2, damping=damping)
 
 
-@pytest.mark.parametrize("damping", [0.3, [0.3, 0.1], MATRIX])
-@pytest.mark.parametrize("separable", [True, False])
-def test_the_vector_field_has_friction_and_its_jacobian(damping, separable):
-    H = "p1**2/2 + p2**2/4 + q1**4/4 + q2**2" + ("" if separable else " + q1*p2")
-    damped, plain = HamiltonianSystem.from_sympy(H, damping=damping), HamiltonianSystem.from_sympy(H)
-    y = np.linspace(-1, 1, 12).reshape(3, 4)
-    G = np.asarray(damping) if np.ndim(damping) == 2 else np.diag(np.broadcast_to(damping, 2))
-    expected = plain.vector_field(y) - np.concatenate([np.zeros((3, 2)), y[:, 2:] @ G], axis=1)
-    np.testing.assert_allclose(damped(0.0, y), expected, rtol=1e-15, atol=1e-15)
-    np.testing.assert_allclose(damped.vector_field(torch.tensor(y)).numpy(), expected, rtol=1e-15, atol=1e-15)
-    jacobian = torch.func.vmap(torch.func.jacfwd(damped.vector_field))(torch.tensor(y)).numpy()
-    np.testing.assert_allclose(damped.field_jacobian(y), jacobian, rtol=1e-14, atol=1e-14)
-
-
 # the drift ---------------------------------------------------------------------------------------------------------
 
 

@@ -5,14 +5,12 @@ import pytest
 
 from sympflow import (
     ClockedFit,
-    HamiltonianSystem,
     get,
     load,
     max_energy_error,
     shipped_flows,
     solve,
     systems,
-    time_transformed,
     train,
 )
 from sympflow.integrators.base import Problem
@@ -32,17 +30,6 @@ def test_the_leapfrog_stays_on_the_ellipse(e):
     r = np.hypot(q1, q2)
     # r = a(1 − e²)/(1 + e cos φ): on the ellipse, though late or early; rounding at the pericentre is 1/(1 − e) larger
     assert np.abs(r + e * q1 - (1 - e * e)).max() < 1e-9
-
-
-def test_the_transformed_functions_are_the_derivatives_of_each_other():
-    functions = HamiltonianSystem(
-        potential=lambda q: -1 / (q**2).sum(-1).sqrt(), ndof=2, y0=systems.kepler(0.6).y0, name="functions"
-    )
-    symbolic, plain = time_transformed(systems.kepler(0.6)), time_transformed(functions)
-    x = np.array([[0.3, 0.4, 1.0, -0.2, 0.9, 0.7], [1.0, 0.2, -3.0, 0.1, 0.4, 0.5]])
-    for name in ("hamiltonian", "gradient", "hessian"):
-        np.testing.assert_allclose(getattr(plain, name)(x), getattr(symbolic, name)(x), rtol=1e-12, atol=1e-12)
-    np.testing.assert_allclose(symbolic.hamiltonian(symbolic.y0), 0.0, atol=1e-14)
 
 
 def test_a_collision_ends_the_run_with_its_time():

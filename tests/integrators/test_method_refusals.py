@@ -49,6 +49,7 @@ def of_damped(metric):
 test_options = refusals(
     (run(HH, "verlet", tol=0.0), r"^`tol` must be a positive number below 1, .*; got 0\.0"),
     (run(HH, "verlet", tol=1e-6, tol_of="q"), "^`tol_of` must be 'energy' or 'state'; got 'q'"),
+    (lambda: sympflow.volume_error(run(HH, "adaptive_heun", rtol=1e-3, atol=1e-3)()), TypeError, "not a one-step map"),
     (run(HH, "rk45", tol=1e-6), TypeError, "^`tol` .* 'rk45' chooses its own: .*`rtol` and `atol`"),
     (run(HH, "verlet", tol=1e-6, dt=0.1), r"^`tol` chooses the step, but `dt` is given, 0\.1"),
     (lambda: solve(HH, "srkn11b", (0, 10), tol=1e-18), "^`tol` 1e-18 is not met .* rounding"),

@@ -1,30 +1,11 @@
 """A method is a scheme × a splitting × a clock: the rows of the table, and triples that a user writes himself."""
 
-import pickle
-
 import numpy as np
 import pytest
 
-from sympflow import available, compare, get, solve, systems
-from sympflow.integrators.compositions import SPLITTINGS
-from sympflow.integrators.methods import TRIPLES
-from sympflow.integrators.splitting import CLOCKS
-from sympflow.schemes import SCHEMES
+from sympflow import compare, get, solve, systems
 
 FPUT, PENDULUM, KEPLER = systems.fput(m=2, omega=20.0), systems.spring_pendulum(), systems.kepler(0.3)
-
-
-@pytest.mark.parametrize("name", TRIPLES)
-def test_every_row_is_a_scheme_a_splitting_and_a_clock_of_the_tables(name):
-    row, method = TRIPLES[name], get(name)()
-    assert name in available()
-    assert (row.scheme in SCHEMES, row.splitting in SPLITTINGS, row.clock in CLOCKS) == (True, True, True)
-    assert (method.name, method.order) == (name, SCHEMES[row.scheme].order)
-    assert (method.splitting, method.clock) == (row.splitting, row.clock)
-    assert method.source
-    assert method.finds_events == (row.clock == "physical")
-    assert method.on_grid == (row.clock == "physical" and not SPLITTINGS[row.splitting].keeps)
-    assert pickle.loads(pickle.dumps(method)) == method
 
 
 @pytest.mark.parametrize(

@@ -192,6 +192,8 @@ test_refusals = refusals(
     (driven(lambda: SympFlow(2)), "^`method` must be one of .* or OdeSolver class"),
     (driven(lambda: as_scipy("verlet", HH), max_step="a"), "^`max_step` must be positive; got 'a'"),
     (driven(lambda: as_scipy("verlet", HH), max_step=-1), "^`max_step` must be positive"),
+    (driven(lambda: as_scipy("verlet", HH), first_step=-1), "^`first_step` must be positive"),
+    (driven(lambda: as_scipy("verlet", HH), first_step=100), "^`first_step` 100 exceeds the interval"),
     (driven(lambda: as_scipy("verlet"), lambda t, y: y), TypeError, "^`system` is needed for method 'verlet'"),
     (driven(lambda: as_scipy("mlp", HH), span=(1, 0)), (TypeError, ValueError), "inverse|negative"),
     (driven(lambda: as_scipy("verlet", PENDULUM), y0=HH.y0[:2]), "is not the system .*: their Hamilt"),
@@ -218,6 +220,7 @@ def test_an_infinite_end_without_an_event_says_so(monkeypatch):
 
 def test_solutions_and_solvers_are_pickled_and_copied():
     method = as_scipy("kahan_li8", OSCILLATOR, dt=0.3)
+    assert pickle.loads(pickle.dumps(method)).integrator == method.integrator
     result = solve_ivp(OSCILLATOR, (0, 1), [1.0, 0.0], method=method, dense_output=True)
     for again in (pickle.loads(pickle.dumps(result.sol)), copy.deepcopy(result.sol)):
         np.testing.assert_array_equal(again(0.4321), result.sol(0.4321))

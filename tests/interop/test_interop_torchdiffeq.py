@@ -158,6 +158,10 @@ class TestDense:
         theirs = torchdiffeq.odeint_dense(HH, y0, times(0.0)[0], times(1.0)[0], method="dopri5")
         ours = odeint_dense(HH, y0, times(0.0)[0], times(1.0)[0], method="dopri5")
         assert torch.equal(theirs(times(0.7)[0]), ours(times(0.7)[0]))
+        found = [
+            run(HH, y0, times(0.0, 1.0), adjoint_params=()) for run in (odeint_adjoint, torchdiffeq.odeint_adjoint)
+        ]
+        assert torch.equal(*found)
         y = odeint_dense(HH, y0, 0.0, 1.0, method="verlet")
         for t in (times(1.1), times(-0.01)):
             with pytest.raises(ValueError, match=r"^`t` must lie between 0 and 1"):

@@ -123,6 +123,7 @@ MADE = {
     "box": lambda x: PAIRS(masses=[1.0, 1.0], box=10.0 + x),
     "softening": lambda x: PAIRS(masses=[1.0, 1.0], softening=0.1 + x),
     "masses": lambda x: PAIRS(masses=[1.0, 1 + x]),
+    "planets": lambda x: HamiltonianSystem.planets([1.0, 1e-3], elements={"a": 1.0}, extra=f"1e-4/r**{3 + x}"),
     "term far out": lambda x: LATTICE(onsite=f"q**2 + {x}*Max(q - 1000, 0)**4"),
     "boundary": lambda x: LATTICE(onsite="q**2", boundary="fixed" if x else "free"),
     "sites": lambda x: LATTICE(onsite="k*q**2", params={"k": 1 + near(x)[4996:5004]}),
