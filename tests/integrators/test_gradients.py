@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy.interpolate import CubicSpline
 
-from sympflow import Box, HamiltonianSystem, get, solve
+from sympflow import HamiltonianSystem, get, solve
 from sympflow.flow.shipped import named
 from sympflow.kernels import reverse
 from sympflow.systems import driven_pendulum, henon_heiles
@@ -118,17 +118,6 @@ def test_gradients_by_parameters(system, method, params, run):
         np.testing.assert_allclose(float(gradient.sum()), difference, rtol=1e-6, atol=1e-7)
 
 
-def test_first_and_second_derivatives():
-    y0 = torch.tensor(start(CUBIC, (2,)), requires_grad=True)
-    k = torch.tensor(1.0, dtype=torch.float64, requires_grad=True)
-
-    def states(y, k):
-        return solve(CUBIC, "srkn6b", (0, 0.3), y, dt=0.1, t_eval=[0.13, 0.3], params={"k": k}).y
-
-    assert torch.autograd.gradcheck(states, (y0, k))
-    assert torch.autograd.gradgradcheck(states, (y0, k))
-
-
 @pytest.mark.parametrize("rows", [1, 300])
 @pytest.mark.parametrize("method", ["verlet", "gauss_legendre4"])
 def test_segments_give_the_same_bits(method, rows, monkeypatch):
@@ -141,59 +130,6 @@ def test_segments_give_the_same_bits(method, rows, monkeypatch):
         found.append((sol.y.detach().numpy(), torch.autograd.grad(weighted(sol), y)[0].numpy()))
     np.testing.assert_array_equal(found[0][0], found[1][0])
     np.testing.assert_array_equal(found[0][1], found[1][1])
-
-
-def test_a_chaotic_run():
-    """Finite differences of the compiled run itself: arrays have other states there."""
-    y0 = np.array([0.0, 0.1, 0.47, 0.1])
-    system = HamiltonianSystem.from_sympy("(p1**2 + p2**2)/2 + (q1**2 + q2**2)/2 + q1**2*q2 - q2**3/3")
-    run = {"t_span": (0, 100), "dt": 0.05, "t_eval": [100.0]}
-    y = torch.tensor(y0, requires_grad=True)
-    (gradient,) = torch.autograd.grad(weighted(solve(system, "verlet", y0=y, **run)), y)
-    columns, h = [], 1e-7
-    for e in np.eye(4):
-        columns.append([float(weighted(solve(system, "verlet", y0=y0 + s * h * e, **run))) for s in (1, -1)])
-    difference = (np.array(columns)[:, 0] - np.array(columns)[:, 1]) / (2 * h)
-    np.testing.assert_allclose(gradient.numpy(), difference, rtol=1e-4, atol=1e-4 * np.abs(difference).max())
-
-
-def test_rows_that_become_infinite_leave_the_others_alone():
-    y0 = np.array([[0.1, 0.0, 0.2, 0.1], [0.0, 30.0, 0.0, 30.0], [0.0, 0.1, 0.3, 0.0]])
-    y = torch.tensor(y0, requires_grad=True)
-    sol = solve(CUBIC, "verlet", (0, 2), y, dt=0.1, diagnose=False)
-    assert list(sol.status) == [0, -1, 0]
-    (gradient,) = torch.autograd.grad(sol.y[[0, 2], :, -1].sum() + sol.y[1, :, 1].sum(), y)
-    for row, last in ((0, -1), (1, 1), (2, -1)):
-        alone = torch.tensor(y0[row], requires_grad=True)
-        t_eval = sol.t[: 2 if last == 1 else None]
-        part = solve(CUBIC, "verlet", (0, 2), alone, dt=0.1, t_eval=t_eval, diagnose=False)
-        expected = torch.autograd.grad(part.y[:, last].sum(), alone)[0]
-        torch.testing.assert_close(gradient[row], expected, rtol=1e-12, atol=0)
-
-
-def test_float32_is_computed_in_double_and_rounded_at_the_outputs():
-    y0 = torch.tensor(start(CUBIC, ()), dtype=torch.float32, requires_grad=True)
-    sol = solve(CUBIC, "verlet", (0, 2), y0, dt=0.1)
-    double = solve(CUBIC, "verlet", (0, 2), y0.detach().double(), dt=0.1)
-    assert sol.y.dtype == torch.float32
-    torch.testing.assert_close(sol.y.detach(), double.y.float(), rtol=0, atol=0)
-    assert torch.autograd.grad(weighted(sol), y0)[0].dtype == torch.float32
-
-
-@pytest.mark.parametrize(
-    ("method", "more", "remedy"),
-    [
-        ("dopri5", {}, "use a splitting method"),
-        ("dop853", {}, "use a splitting method"),
-        ("verlet", {"backend": "array"}, "Detach them"),
-        ("verlet", {"events": lambda t, y: y[0]}, "leave these out"),
-        ("verlet", {"on_domain_exit": "stop"}, "leave these out"),
-    ],
-)
-def test_parameters_to_which_no_gradient_flows(method, more, remedy):
-    k = torch.tensor(1.0, requires_grad=True)
-    with pytest.raises(ValueError, match=rf"^`params` has k.*{remedy}"):
-        solve(CUBIC, method, (0, 1), start(CUBIC, ()), params={"k": k}, **more)
 
 
 @pytest.mark.parametrize(("system", "batch"), [(CUBIC, ()), (DRIVEN, (2,)), (DAMPED, ())])
@@ -218,23 +154,6 @@ def test_gradients_by_times(system, batch, t_eval):
 
 
 @pytest.mark.parametrize("method", ["verlet", "rk4", "gauss_legendre4"])
-def test_transforms_of_runs(method):
-    """Jacobians and Hessians of a compiled run by torch.func, forward and reverse, by tensor operations."""
-    y0 = torch.tensor(start(CUBIC, ()))
-
-    def end(y):
-        return solve(CUBIC, method, (0, 0.5), y, dt=0.1, t_eval=[0.5]).y[:, 0]
-
-    J = torch.autograd.functional.jacobian(end, y0)
-    for each in (torch.func.jacrev(end)(y0), torch.func.jacfwd(end)(y0)):
-        torch.testing.assert_close(each, J, rtol=1e-12, atol=1e-13)
-    H = torch.autograd.functional.hessian(lambda y: (end(y) ** 2).sum(), y0)
-    torch.testing.assert_close(torch.func.hessian(lambda y: (end(y) ** 2).sum())(y0), H, rtol=1e-11, atol=1e-12)
-    with pytest.raises(TypeError, match=r"^`params` has k that torch\.func"):
-        torch.func.jvp(lambda k: solve(CUBIC, method, (0, 1), y0, dt=0.1, params={"k": k}).y, (ONE,), (ONE,))
-
-
-@pytest.mark.parametrize("method", ["verlet", "rk4", "gauss_legendre4"])
 def test_drives_by_samples_move_no_derivative_of_a_linear_system(method):
     t = np.linspace(0, 2, 21)
     system = HamiltonianSystem.from_sympy("p**2/2 + q**2/2 - f*q", params={"f": CubicSpline(t, np.sin(t))})
@@ -244,29 +163,6 @@ def test_drives_by_samples_move_no_derivative_of_a_linear_system(method):
         assert sol.stats["backend"] == "compiled"
         slopes.append(torch.autograd.grad(sol.y[0, -1], y0)[0])
     torch.testing.assert_close(*slopes, rtol=1e-13, atol=1e-14)
-
-
-@pytest.mark.parametrize("asked", [{"events": lambda t, y: y[0] - 0.05}, {"on_domain_exit": "stop"}])
-def test_outputs_have_the_same_gradients_with_events_and_up_to_a_stop(asked):
-    system = HamiltonianSystem.from_sympy("(p**2 + q**2)/2", domain=Box([-1, -0.35], [1, 1]))
-    found = []
-    for more in (asked, {}):
-        y = torch.tensor([0.3, 0.2], dtype=torch.float64, requires_grad=True)
-        sol = solve(system, "verlet", (0, 3), y, dt=0.07, **more)
-        n = len(found[0][0]) if found else len(sol.t)
-        found.append((sol.t[:n], torch.autograd.grad(sol.y[:, n // 2].sum() + sol.y[0, n - 1], y)[0]))
-    assert (n < len(sol.t)) == ("on_domain_exit" in asked)
-    torch.testing.assert_close(found[0][1], found[1][1], rtol=1e-14, atol=0)
-
-
-def test_dense_output_has_the_gradients_of_outputs():
-    found = []
-    for more in ({"dense_output": True}, {"t_eval": [1.234]}):
-        y = torch.tensor(start(CUBIC, ()), requires_grad=True)
-        sol = solve(CUBIC, "srkn6b", (0, 2), y, dt=0.1, **more)
-        state = sol.y[:, 0] if not sol.sol else sol.sol(1.234)
-        found.append(torch.autograd.grad(state.sum(), y)[0])
-    torch.testing.assert_close(*found, rtol=1e-13, atol=0)
 
 
 class Coordinates(torch.nn.Module):
@@ -315,20 +211,6 @@ def test_weights_of_a_network_in_H(kind, method, run, batch):
     np.testing.assert_array_equal(solve(system, method, y0=y0, **run).y, found[0][0].numpy())
 
 
-def test_weights_are_arguments():
-    """A step of an optimizer changes the run, and nothing is compiled again; what is not followed is refused."""
-    net, V = network("two layers")
-    system, y0 = HamiltonianSystem(V, ndof=2), start(CUBIC, (3,))
-    solve(system, "verlet", (0, 1), y0, dt=0.1)
-    with torch.no_grad():
-        net[2].weight *= 1.5
-    again = solve(system, "verlet", (0, 1), y0, dt=0.1)
-    np.testing.assert_array_equal(again.y, solve(HamiltonianSystem(V, ndof=2), "verlet", (0, 1), y0, dt=0.1).y)
-    net[2] = torch.nn.Linear(9, 8).double()
-    with pytest.raises(ValueError, match=r"^`potential` has another value than when it was traced"):
-        solve(system, "verlet", (0, 1), y0, dt=0.1)
-
-
 def test_networks_that_are_no_chain_run_as_arrays():
     net, V = network("two layers")
     system = HamiltonianSystem(lambda q: V(q) + V(q + 0.1), ndof=2)
@@ -336,19 +218,6 @@ def test_networks_that_are_no_chain_run_as_arrays():
     assert sol.stats["backend"] == "torch"
     assert "its linear layers do not follow one another" in repr(system)
     assert torch.autograd.grad(sol.y.sum(), net[0].weight)[0].abs().max() > 0
-
-
-def test_second_derivatives_by_weights_through_two_runs():
-    net, V = network("two layers")
-    system, found = HamiltonianSystem(V, ndof=2), []
-    for backend in ("compiled", "array"):
-        middle = solve(system, "verlet", (0, 0.5), torch.tensor(start(system, (2,))), dt=0.1, backend=backend).y[
-            ..., -1
-        ]
-        end = solve(system, "verlet", (0, 0.5), middle, dt=0.1, t_eval=[0.5], backend=backend).y
-        first = torch.autograd.grad((end**2).sum(), [p for p in net.parameters() if p.numel() > 1], create_graph=True)
-        found.append(torch.autograd.grad(sum((g**2).sum() for g in first), net[2].weight)[0])
-    torch.testing.assert_close(*found, rtol=1e-11, atol=1e-14)
 
 
 def test_rows_that_become_infinite_add_nothing_to_derivatives_by_weights():
@@ -365,9 +234,29 @@ def test_rows_that_become_infinite_add_nothing_to_derivatives_by_weights():
 ONE = torch.tensor(1.0, dtype=torch.float64, requires_grad=True)
 
 
+def moved(force):
+    """A run whose jumps a parameter moves: the derivative of a state by their time is that of no stage."""
+    system = HamiltonianSystem.from_sympy(f"p**2/2 + q**2/2 - q*{force}", time="t", params={"c": 1.3}, y0=[0.0, 0.0])
+    return solve(system, "kahan_li8", (0, 3), dt=0.1, params={"c": ONE})
+
+
 @pytest.mark.parametrize(
     ("call", "error", "message"),
     [
+        *(
+            (lambda y, m=m, more=more: solve(CUBIC, m, (0, 1), y, params={"k": ONE}, **more), ValueError, "has k.*" + x)
+            for m, more, x in (
+                ("dopri5", {}, "use a splitting method"),
+                ("dop853", {}, "use a splitting method"),
+                ("verlet", {"backend": "array"}, "Detach them"),
+                ("verlet", {"events": lambda t, y: y[0]}, "leave these out"),
+                ("verlet", {"on_domain_exit": "stop"}, "leave these out"),
+            )
+        ),
+        *(
+            (lambda y, f=f: moved(f), ValueError, "c that requires gradients and moves the times at which H jumps")
+            for f in ("Heaviside(t - c)", "floor(c*t)", "Piecewise((1, t < c), (0, True))")
+        ),
         (lambda y: solve(CUBIC, "verlet", (0, ONE), y, dt=0.1, dense_output=True), ValueError, "^`t_span`.*detach"),
         (lambda y: solve(CUBIC, "verlet", (0, 1), y, dt=0.1, t_eval=[ONE], store="out"), ValueError, "^`t_span` or"),
         (lambda y: solve(CUBIC, "verlet", (0, 1), y, dt=ONE / 10), ValueError, "^`dt`"),
@@ -381,15 +270,6 @@ ONE = torch.tensor(1.0, dtype=torch.float64, requires_grad=True)
 def test_what_no_gradient_flows_to_is_refused(call, error, message):
     with pytest.raises(error, match=message):
         call(torch.tensor(start(CUBIC, ()), requires_grad=True))
-
-
-@pytest.mark.parametrize("force", ["Heaviside(t - c)", "floor(c*t)", "Piecewise((1, t < c), (0, True))"])
-def test_parameters_that_move_jumps_are_refused(force):
-    """The derivative of a state by the time of a jump is that of no stage: for Θ(t − c), −sin(3 − c)."""
-    system = HamiltonianSystem.from_sympy(f"p**2/2 + q**2/2 - q*{force}", time="t", params={"c": 1.3}, y0=[0.0, 0.0])
-    c = torch.tensor(1.234, dtype=torch.float64, requires_grad=True)
-    with pytest.raises(ValueError, match="c that requires gradients and moves the times at which H jumps"):
-        solve(system, "kahan_li8", (0, 3), dt=0.1, params={"c": c})
 
 
 @pytest.mark.parametrize("method", ["gauss_legendre4", "gauss_legendre6", "gauss_legendre8"])
@@ -515,39 +395,6 @@ def test_masses_of_bodies_are_parameters_of_a_run():
     for wrong, message in (([1.0, 2.0], "one for each of the 3 bodies"), ([1.0, 0.0, 1.0], "not positive")):
         with pytest.raises(ValueError, match=f"^`params` has masses .*{message}"):
             solve(system, "verlet", (0.0, 1.0), y0, dt=0.01, params={"masses": wrong})
-
-
-def test_functions_of_tensors_run_in_inference_mode():
-    y0, weight = torch.tensor([0.3, 0.5, -0.2, 0.7], dtype=torch.float64), torch.ones((), requires_grad=True)
-    expected = verlet_by_hand(y0, torch.ones(()), 10, 0.1)
-    for V in (of_two, lambda q: weight * of_two(q)):
-        with torch.inference_mode():
-            found = solve(HamiltonianSystem(V, ndof=2), "verlet", (0, 1), y0, dt=0.1).y[:, -1]
-        np.testing.assert_allclose(found.numpy(), expected.numpy(), rtol=0, atol=1e-14)
-
-
-@pytest.mark.parametrize("fixed", ["all", "first"])
-def test_layers_whose_weights_are_fixed_are_compiled_whatever_their_width(fixed):
-    net = torch.nn.Sequential(torch.nn.Linear(2, 128), torch.nn.Tanh(), torch.nn.Linear(128, 128), torch.nn.Tanh())
-    net = net.append(torch.nn.Linear(128, 1)).double()
-    (net if fixed == "all" else net[0]).requires_grad_(False)
-    weights = [w for w in net.parameters() if w.requires_grad][:-1]  # the last bias has no force
-    y0 = torch.tensor([0.3, 0.5, -0.2, 0.7], dtype=torch.float64, requires_grad=True)
-    system, (q, p) = HamiltonianSystem(lambda q: net(q)[..., 0], ndof=2), y0.chunk(2)
-    force = torch.func.grad(lambda q: net(q)[..., 0])
-    for _ in range(5):
-        p = p - 0.05 * force(q)
-        q = q + 0.1 * p
-        p = p - 0.05 * force(q)
-    sol = solve(system, "verlet", (0, 0.5), y0, dt=0.1)
-    assert sol.stats["backend"] == "compiled"
-    torch.testing.assert_close(sol.y[:, -1], torch.cat([q, p]), rtol=0, atol=1e-14)
-    found = torch.autograd.grad(sol.y[:, -1].square().sum(), [y0, *weights])
-    expected = torch.autograd.grad(torch.cat([q, p]).square().sum(), [y0, *weights])
-    for a, b in zip(found, expected, strict=True):
-        torch.testing.assert_close(a, b, rtol=0, atol=1e-13)
-    other = solve(system, "gauss_legendre4", (0, 0.5), y0.detach().numpy(), dt=0.1)  # by arrays
-    np.testing.assert_allclose(other.y[:, -1], sol.y[:, -1].detach(), atol=0.01)
 
 
 @pytest.mark.parametrize("method", ["verlet", "rk4", "linear_aba864", "mollified_impulse", "tao4", "strang_parts"])

@@ -66,7 +66,6 @@ test_options = refusals(
     (run(HH, Scheme("own", 1, (1.0,), (1.0,))), TypeError, r"^`method` must be .* got Scheme\. Make one of it by"),
     (run(HH, "rk45", backend="compiled"), "^`backend` 'compiled' does not apply to method 'rk45'"),
     (run(HH, "verlet", backend="compiled", dtype="float32"), f"{NOT_COMPILED}. `y0` is float32"),
-    (run(HH, "tao4", backend="compiled", y0=followed), "^`backend` 'compiled' .* `y0` "),
     (run(PLAIN, "verlet", backend="compiled"), r"^`backend` .* functions could not be traced: numpy\.median"),
     (run(AIRY, "verlet", backend="compiled"), NOT_COMPILED),
     (run(PLAIN, "verlet", compensated=True), "^`compensated` sums need compiled loops"),
