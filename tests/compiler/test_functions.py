@@ -135,24 +135,6 @@ def test_the_highest_derivative_of_the_logarithm_of_gamma_is_the_last():
         traced(lambda x: derivatives([apply("polygamma6", x)], [x])[0], "x")
 
 
-def test_conditions_and_choices():
-    def choose(x, y):
-        inside = apply("and", x < y, apply("not", apply("eq", x, 0.0)))
-        return apply("where", apply("or", inside, y <= -2.0), x * y, x - y)
-
-    x, y = np.array([1.0, 0.0, 3.0, -3.0]), np.array([2.0, 1.0, 1.0, -4.0])
-    expected = [2.0, -1.0, 2.0, 12.0]
-    tensors = torch.tensor(x), torch.tensor(y)
-    program = traced(lambda x, y: [choose(x, y), *derivatives([choose(x, y)], [x, y])[0]], "x", "y")
-    for values in ((x, y), tensors):
-        np.testing.assert_array_equal(choose(*values), expected)
-        value, by_x, by_y = program(*values)
-        np.testing.assert_array_equal(value, expected)
-        np.testing.assert_array_equal(by_x, [2.0, 1.0, 1.0, -4.0])
-        np.testing.assert_array_equal(by_y, [1.0, -1.0, -1.0, -3.0])
-    np.testing.assert_array_equal(run(choose, x, y, width=4), expected)
-
-
 @pytest.mark.parametrize("make", [np.array, torch.tensor])
 def test_a_choice_between_two_floats_is_in_double_precision(make):
     y = apply("where", make([True, False]), 0.1, 0.2)

@@ -384,19 +384,6 @@ def test_gradients_flow_to_masses_and_parameters_of_bodies(kind, batch):
     np.testing.assert_allclose(of_G, (end(np.array(masses), 1.2 + h) - end(np.array(masses), 1.2 - h)) / (2 * h), 1e-6)
 
 
-def test_masses_of_bodies_are_parameters_of_a_run():
-    masses, y0 = np.array([1.0, 0.5, 0.2]), np.arange(18.0)
-    system = HamiltonianSystem.pairs("-1/r", masses=[1.0, 1.0, 1.0])
-    anew = HamiltonianSystem.pairs("-1/r", masses=masses)
-    sol = solve(system, "verlet", (0.0, 1.0), y0, dt=0.01, params={"masses": masses})
-    expected = solve(anew, "verlet", (0.0, 1.0), y0, dt=0.01)
-    np.testing.assert_array_equal(sol.y, expected.y)
-    np.testing.assert_array_equal(sol.energy(), expected.energy())
-    for wrong, message in (([1.0, 2.0], "one for each of the 3 bodies"), ([1.0, 0.0, 1.0], "not positive")):
-        with pytest.raises(ValueError, match=f"^`params` has masses .*{message}"):
-            solve(system, "verlet", (0.0, 1.0), y0, dt=0.01, params={"masses": wrong})
-
-
 @pytest.mark.parametrize("method", ["verlet", "rk4", "linear_aba864", "mollified_impulse", "tao4", "strang_parts"])
 def test_other_values_of_parameters_compile_nothing(method, monkeypatch):
     system = HamiltonianSystem.from_sympy("(p1**2/m + p2**2 + k*q1**2 + q2**2)/2 + g*q1*q2**2", params=PARAMS)

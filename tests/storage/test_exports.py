@@ -67,27 +67,6 @@ def test_files_give_the_same_back(tmp_path):
 
 
 @needs_data
-def test_single_trajectories_events_and_failures():
-    def falls(t, y):
-        return y[0] - 0.05
-
-    y0 = [0.1, 0.0, 0.0, 0.0]
-    sol = sympflow.solve(OSCILLATOR, "verlet", (0, 8), y0, events=[falls, lambda t, y: y[1] + 9])
-    data = sol.to_xarray()
-    assert data.q.dims == ("dof", "time")
-    assert data.status.item() == 0
-    assert np.array_equal(data.t_event_0, sol.t_events[0])
-    assert data.sizes["event_0"] == 3
-    assert np.array_equal(np.concatenate([data.q_event_0, data.p_event_0]).T, sol.y_events[0])
-    assert data.q_event_1.shape == (2, 0)
-    far = np.array([y0, [-60.0, -60.0, 0.0, 0.0]])
-    failed = sympflow.solve(OSCILLATOR, "verlet", (0, 8), far).to_xarray()
-    assert failed.status.values.tolist() == [0, -1]
-    assert "trajector" in failed.attrs["message"]
-    assert np.isnan(failed.q[1, :, -1]).all()
-
-
-@needs_data
 def test_tables_have_a_row_for_each_time():
     sol = solved(params={"k": [1.0, 2.0, 3.0]})
     table = sol.to_dataframe()

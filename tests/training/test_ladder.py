@@ -14,7 +14,6 @@ from sympflow import (
     HamiltonianSystem,
     SympFlow,
     energy_balance_error,
-    get,
     load,
     max_energy_error,
     shipped_flows,
@@ -74,15 +73,6 @@ def test_the_cheapest_that_meets_the_tolerance_is_taken(three, tol, stages):
     assert sol.stats["force_evaluations"] == 4 * stages
     reference = solve(PENDULUM, SympFlow.primed(PENDULUM, stages, dt=0.5), (0.0, 2.0))
     np.testing.assert_array_equal(sol.y, reference.y)
-
-
-def test_a_configured_integrator_takes_a_tolerance(three):
-    method = get("sympflow")(tol=1e-5)
-    assert method.step_length(PENDULUM) == 0.5
-    assert solve(PENDULUM, method, (0.0, 2.0)).stats["force_evaluations"] == 4 * 6
-    y = torch.tensor([[0.3, 0.1]], dtype=torch.float64)
-    assert method.step(PENDULUM, 0.0, y, 0.5).shape == (1, 2)
-    assert solve(PENDULUM, method, (0.0, 1.0), y0=[0.3, 0.1], dtype="float32").y.dtype == np.float32
 
 
 def test_a_tolerance_is_not_met_outside_the_domain():
