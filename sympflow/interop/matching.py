@@ -67,7 +67,7 @@ class Comparison:
         self.flow: Any = integrator.given_flow if system is None else integrator.flow_for(system)
         self.states_compared, self.known = 0, False
         self._next, self._gap = FIRST_LOOK, FIRST_LOOK
-        self.given = None if given is system else given
+        self.given: Any = None if given is system else given
         if system is None or given is system or not isinstance(given, HamiltonianSystem):
             return
         if system.ndof != given.ndof or not same_system(system.fingerprint, given.fingerprint):

@@ -226,10 +226,10 @@ class Path:
                 def inside(s: float, begin: float = begin, y: Tensor = states[j], t: float = t) -> Tensor:
                     return self.step(y, s - begin, t)
 
-                search.step(begin, states[j], (k + j + 1) * self.h, states[j + 1], inside, inner[j])
+                search.step(begin, states[j], (k + j + 1) * self.h, states[j + 1], inside, list(inner[j]))
                 if search.found[0]:
                     return search.found[0][0][0]
-                if not np.isfinite(search.values).all():
+                if not np.isfinite(search.values or ()).all():
                     raise RuntimeError(
                         f"`event_fn` found no zero: the solution became non-finite after an elapsed time of "
                         f"{begin:.6g}. Check y0, or use a smaller dt."

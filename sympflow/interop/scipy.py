@@ -64,8 +64,8 @@ def as_scipy(method: Any, system: HamiltonianSystem | None = None, **options: An
 
 def _solver_class(integrator: FixedStep, system: HamiltonianSystem | None) -> type[FlowSolver]:
     name = f"{integrator.name.title().replace('_', '')}Solver"
-    namespace = {"integrator": integrator, "system": system, "__doc__": FlowSolver.__doc__}
-    namespace["made_of"] = _solver_class, (integrator, system)
+    made_of = _solver_class, (integrator, system)
+    namespace = {"integrator": integrator, "system": system, "__doc__": FlowSolver.__doc__, "made_of": made_of}
     return Made(name, (FlowSolver,), namespace)  # type: ignore[return-value]
 
 
