@@ -61,3 +61,25 @@ def test_networks_take_any_hamiltonian_and_drives_without_a_period():
     solve(system, flow, (0, 4))
     with pytest.warns(UserWarning, match="a drive without a period"):
         solve(system, flow, (0, 5))
+
+
+X = torch.tensor([[0.5, 0.1], [-0.3, 0.8], [0.9, -0.6]], dtype=torch.float64)
+
+
+@pytest.fixture(scope="module")
+def hardly(system):
+    """Trained for a few steps that compile nothing: it is a flow of this drive, and not a good one."""
+    few = {"points": 20, "validation_points": 20, "reference_states": 5, "label_weight": 0.0, "progress": False}
+    return sympflow.train(system, kind="sympflow", pairs=2, hidden=(8,), dt=DT, optimizer="adam", steps=3, **few)
+
+
+def test_a_file_holds_it_with_its_drive(system, hardly, tmp_path):
+    hardly.save(tmp_path / "flow.safetensors")
+    again = sympflow.load(tmp_path / "flow.safetensors", system=system)
+    torch.testing.assert_close(again(1.7, X, t0=0.3), hardly(1.7, X, t0=0.3), rtol=0, atol=0)
+    assert (again.drive, again.period) == (hardly.drive, system.period)
+    with pytest.raises(ValueError, match="was trained with another drive"):
+        solve(driven(a=0.2), again, (0, 1))
+    other = again.transferred(driven(a=0.2))
+    torch.testing.assert_close(other(1.7, X, t0=0.3), hardly(1.7, X, t0=0.3), rtol=0, atol=0)
+    solve(driven(a=0.2), other, (0, 1))

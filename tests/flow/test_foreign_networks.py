@@ -15,7 +15,7 @@ from torch import nn
 from sympflow import SympFlow, load, solve, systems, train
 from sympflow.flow import potentials
 from sympflow.flow.layers import Drift, Kick
-from sympflow.flow.potentials import MLPPotential, Potential, activation_named, register_activation
+from sympflow.flow.potentials import MLPPotential, Potential, activation_named, register_activation, register_potential
 from sympflow.flow.scaling import Scaling
 
 PENDULUM = systems.pendulum()
@@ -258,3 +258,40 @@ def test_a_file_finds_what_installed_plugins_announce(announced, tmp_path):
         activation_named("seven")
     with pytest.raises(ImportError, match=r"^`potential` 'pi' of the plug-in .* is not valid"):
         potentials.potential_named("pi")
+
+
+def test_closed_forms_of_a_user_are_checked():
+    class Wrong(potentials.Activation):
+        def slope(self, a):
+            return potentials.ACTIVATIONS["tanh"].slope(a)
+
+        def tangent(self, a, da):
+            h, slope, dh, dslope = potentials.ACTIVATIONS["tanh"].tangent(a, da)
+            return h, slope, dh, -dslope
+
+    with pytest.raises(ValueError, match=r"^`activation` 'wrong' has a tangent\(\) whose dslope is not that of value"):
+        register_activation("wrong", Wrong())
+
+
+class Crooked(Square):
+    @classmethod
+    def from_dict(cls, ndof, plan, dtype):
+        raise KeyError("width")
+
+
+def test_a_file_says_which_potential_it_needs_and_how_it_gets_it(tmp_path, monkeypatch):
+    path = tmp_path / "flow.safetensors"
+    flow = SympFlow.from_layers([Kick(Square(1)), Drift(MLPPotential(1, (3,)))], dt=0.5)
+    with pytest.raises(ValueError, match=r"^`flow` has a potential Square that no file can name: register the class"):
+        flow.save(path)
+    assert not path.exists()
+    register_potential("square", Square)
+    flow.save(path)
+    x = states(2, 1)
+    assert torch.equal(load(path)(0.4, x), flow(0.4, x))
+    register_potential("square", Crooked)
+    with pytest.raises(ValueError, match=r"its potential 'square' cannot be built \(KeyError: 'width'\)"):
+        load(path)
+    monkeypatch.setattr(potentials.potentials, "added", {})
+    with pytest.raises(ValueError, match=r"it needs the potential 'square', .* sympflow.flow.potentials.register_pot"):
+        load(path)

@@ -159,3 +159,12 @@ def test_bad_complex_fields_are_refused(changed, message):
 def test_methods_for_potentials_refuse_a_complex_field(method, message):
     with pytest.raises(ValueError, match=f"^{message}"):
         solve(TRAP, method, (0, 1), np.ones(48), dt=0.1)
+
+
+def test_angles_of_more_than_a_half_turn():
+    """A single site, where the solution is known: ψ e^{−i(ω + f')t}."""
+    one = HamiltonianSystem.schroedinger("rho**2", shape=1, dispersion="2")
+    for s in (0.4, 1.9, 3.2, -7.0, 40.0):
+        q, p = solve(one, "impulse", (0, s), [1.2, -0.9], dt=abs(s), t_eval=[s]).y[:, -1]
+        rho = (1.2**2 + 0.9**2) / 2
+        assert q + 1j * p == pytest.approx((1.2 - 0.9j) * np.exp(-1j * (2 + 2 * rho) * s), abs=1e-13)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sympflow import HamiltonianSystem, solve, splitting_method
-from sympflow.kernels.pairs import PairForces
+from sympflow.kernels.pairs import PairCode, PairForces
 from sympflow.kernels.threads import at_most
 from sympflow.schemes import SCHEMES
 from sympflow.training.table_step import ArrayForces
@@ -141,6 +141,24 @@ class TestRuns:
         sol = solve(system, "verlet", (0, 0.5))
         assert sol.stats["backend"] == "compiled"
         np.testing.assert_allclose(sol.y, solve(system, "verlet", (0, 0.5), backend="array").y, rtol=0, atol=1e-11)
+
+    def test_a_thread_that_fails_ends_the_others(self, monkeypatch):
+        system = gravity(330)
+        function = PairCode.function
+
+        def failing(self, name, width):
+            run, fails = function(self, name, width), iter([False, True])
+
+            def member(*given):
+                if next(fails, False):
+                    raise MemoryError("no room")
+                run(*given)
+
+            return member
+
+        monkeypatch.setattr(PairCode, "function", failing)
+        with at_most(3), pytest.raises(MemoryError, match="no room"):
+            solve(system, "verlet", (0, 1), t_eval=[1], backend="compiled")
 
 
 @pytest.mark.parametrize(

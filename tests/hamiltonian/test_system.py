@@ -1,6 +1,7 @@
 """HamiltonianSystem: symbolic and callable definitions agree with each other and with automatic differentiation."""
 
 import math
+from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -128,6 +129,22 @@ class TestNumbaFunctions:
         torch.testing.assert_close(gradient, self.system.gradient(y))
         jacobian = torch.func.vmap(torch.func.jacfwd(self.system.force))(y[:, :2])
         torch.testing.assert_close(jacobian, -self.system.potential_hessian(y[:, :2]))
+
+    def test_gradients_flow_through_solve(self):
+        def end(y0):
+            return solve(self.system, "verlet", (0, 0.2), y0=y0, dt=0.1).y[:, -1]
+
+        y0 = torch.tensor([0.3, 0.2, 0.1, -0.2], dtype=torch.float64, requires_grad=True)
+        assert torch.autograd.gradcheck(end, y0)
+
+    def test_derivatives_flow_in_both_modes(self):
+        q = torch.tensor(states(self.system, 3)[:, :2], requires_grad=True)
+        v = torch.randn(3, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0), requires_grad=True)
+        assert torch.autograd.gradcheck(self.system.potential, q, check_forward_ad=True)
+        assert torch.autograd.gradcheck(self.system.force, q, check_forward_ad=True)
+        assert torch.autograd.gradgradcheck(self.system.potential, q)
+        fixed = q.detach()
+        assert torch.autograd.gradcheck(lambda w: self.system.hessian_vector(fixed, w), v, check_forward_ad=True)
 
 
 test_bad_definitions_are_named = refusals(
@@ -288,6 +305,12 @@ class TestParameters:
         with pytest.raises(error, match=f"^`{next(iter(scene))}` must be"):
             made("p**2/2 + q**2/2", **scene)
 
+    @pytest.mark.parametrize("value", [2, np.float32(2), np.array(2.0), Fraction(2), sympy.Integer(2)])
+    def test_of_every_kind_of_number_are_numbers_of_python(self, value):
+        system = made("p**2/2 + a*q**2/2", params={"a": value})
+        assert type(system.params["a"]) in (int, float)
+        assert system.params["a"] == 2 == -system.force(np.array([1.0]))[0]
+
 
 @pytest.mark.parametrize("domain", [None, Ball([0.0, 0.0], 1.0)])
 @pytest.mark.parametrize("method", ["kahan_li8", "log_kahan_li8", "tao4"])
@@ -305,3 +328,18 @@ def test_long_sums_are_evaluated_in_pieces(monkeypatch):
     q, k = np.array([0.3]), np.arange(1, 9)
     assert math.isclose(system.potential(q), (q**2 / (q + k)).sum(), rel_tol=1e-14)
     assert math.isclose(system.potential(torch.from_numpy(q)).item(), (q**2 / (q + k)).sum(), rel_tol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("potential", "error", "message"),
+    [
+        (lambda q: q, ValueError, r"^`potential` must return shape \(5,\) .*; got \(5, 2\)"),
+        (lambda q: (q**2).sum(), ValueError, r"^`potential` must return shape \(5,\)"),
+        (lambda q: np.cos(q.detach().numpy()), TypeError, "^`potential` failed on a torch tensor"),
+    ],
+)
+def test_functions_of_the_wrong_kind_are_explained(potential, error, message):
+    system = HamiltonianSystem(potential, ndof=2)
+    with pytest.raises(error, match=message):
+        system.vector_field(np.zeros((5, 4)))
+        system.hamiltonian(np.zeros((5, 4)))

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from sympflow import HamiltonianSystem, systems
+import sympflow
+from sympflow import HamiltonianSystem, SympFlow, systems
 
 SHAPES = {  # V', V'', V''' of u = q − origin
     "cosh": (np.sinh, np.cosh, np.sinh),
@@ -59,3 +60,32 @@ def test_positions_of_another_shape_are_refused():
     for method in functions:
         with pytest.raises(ValueError, match=r"^`q` must have shape \(\.\.\., 2\), .* got \(3,\)"):
             method(np.array([0.1, 0.2, 9.0]))
+
+
+@pytest.mark.parametrize("curvature", [False, True])
+def test_the_velocity_of_a_flow_of_numba_functions(curvature, tmp_path):
+    """A step h = (1000 ε)^⅕ divides the rounding of what is differenced: of q, or of a difference already."""
+    from numba import njit
+
+    @njit
+    def potential(q):
+        return -np.cos(q[0] - 1000)
+
+    @njit
+    def gradient(q, out):
+        out[0] = np.sin(q[0] - 1000)
+
+    @njit
+    def product(q, v, out):
+        out[0] = np.cos(q[0] - 1000) * v[0]
+
+    symbolic = HamiltonianSystem.from_sympy("p**2/2 - cos(q - 1000)")
+    compiled = HamiltonianSystem(potential=potential, gradient=gradient, hessian_vector=product, ndof=1)
+    flow = SympFlow.primed(symbolic, 2, dt=1.0, processor=1, curvature=curvature)
+    for parameter in flow.parameters():
+        parameter.data += 0.1 * torch.linspace(-1, 1, parameter.numel(), dtype=torch.float64).reshape(parameter.shape)
+    flow.save(tmp_path / "flow.safetensors")
+    same = sympflow.load(tmp_path / "flow.safetensors", system=compiled)
+    x = torch.tensor([[1000.0, 0.3], [1000.7, 0.2], [1001.57, 0.4], [1000.0, 0.0]], dtype=torch.float64)
+    accuracy = 10 * (np.finfo(float).eps * 1000) ** (0.6 if curvature else 0.8)
+    assert (same.velocity(0.6, x) - flow.velocity(0.6, x)).abs().max() < accuracy

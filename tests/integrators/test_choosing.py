@@ -176,3 +176,18 @@ def test_trial_runs_end_steps_where_H_jumps(asked):
     error = sympflow.reference_error(sol).max()
     assert 1e-13 < error <= asked["tol"]
     assert 0.5 < sol.stats["state_error"] / error < 2
+
+
+@pytest.mark.parametrize(("sign", "slow"), [(1, True), (-1, False)])
+def test_a_step_is_doubted_for_motions_that_there_are(sign, slow):
+    """Two oscillators with a stiff spring, driven together: the spring moves in one case and rests in the other."""
+    H = "(p1**2 + p2**2)/2 + (q1**2 + q2**2)/2 + 50*(q1 - q2)**2 - cos(t/2)*(q1 + q2)/5"
+    system = HamiltonianSystem.from_sympy(H, time="t")
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        sol = solve(system, "verlet", (0, 30), [1.0, sign, 0.0, 0.0], dt=0.05)
+    t, common = sol.t, 4 / 15 * (np.cos(sol.t / 2) - np.cos(sol.t))  # of both from rest
+    apart = np.cos(t) if slow else np.cos(np.sqrt(201) * t)
+    error = np.abs(sol.y[0] - common - apart).max()
+    assert ["rate of the motion is 14.2" in str(warning.message) for warning in told] == [True] * (not slow)
+    assert error < 0.01 if slow else error > 1

@@ -1,5 +1,6 @@
 """Forces of a step that does not say how many it evaluates: counted by the driver, whatever the run."""
 
+import pickle
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -95,3 +96,12 @@ def test_a_step_that_takes_no_tensors_says_so(method, message):
     with pytest.raises(TypeError, match=message):
         solve(HH, method(dt=0.1), (0, 1), y0)
     assert solve(HH, method(dt=0.1), (0, 1), HH.y0).success
+
+
+def test_a_view_passes_for_its_system():
+    view = counting_view(HH, lambda what, x: None)
+    assert isinstance(view, type(HH))
+    assert {HH: 1}[view] == 1
+    assert view == HH
+    assert view.fingerprint == HH.fingerprint
+    assert type(pickle.loads(pickle.dumps(view))) is type(HH)

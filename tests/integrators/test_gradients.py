@@ -395,3 +395,25 @@ def test_other_values_of_parameters_compile_nothing(method, monkeypatch):
             for backend in ("compiled", "array")
         )
         np.testing.assert_allclose(found.y, expected.y, rtol=0, atol=1e-14)
+
+
+def test_float32_is_computed_in_double_and_rounded_at_the_outputs():
+    y0 = torch.tensor(start(CUBIC, ()), dtype=torch.float32, requires_grad=True)
+    sol = solve(CUBIC, "verlet", (0, 2), y0, dt=0.1)
+    double = solve(CUBIC, "verlet", (0, 2), y0.detach().double(), dt=0.1)
+    assert sol.y.dtype == torch.float32
+    torch.testing.assert_close(sol.y.detach(), double.y.float(), rtol=0, atol=0)
+    assert torch.autograd.grad(weighted(sol), y0)[0].dtype == torch.float32
+
+
+def test_masses_of_bodies_are_parameters_of_a_run():
+    masses, y0 = np.array([1.0, 0.5, 0.2]), np.arange(18.0)
+    system = HamiltonianSystem.pairs("-1/r", masses=[1.0, 1.0, 1.0])
+    anew = HamiltonianSystem.pairs("-1/r", masses=masses)
+    sol = solve(system, "verlet", (0.0, 1.0), y0, dt=0.01, params={"masses": masses})
+    expected = solve(anew, "verlet", (0.0, 1.0), y0, dt=0.01)
+    np.testing.assert_array_equal(sol.y, expected.y)
+    np.testing.assert_array_equal(sol.energy(), expected.energy())
+    for wrong, message in (([1.0, 2.0], "one for each of the 3 bodies"), ([1.0, 0.0, 1.0], "not positive")):
+        with pytest.raises(ValueError, match=f"^`params` has masses .*{message}"):
+            solve(system, "verlet", (0.0, 1.0), y0, dt=0.01, params={"masses": wrong})

@@ -3,16 +3,7 @@
 import numpy as np
 import pytest
 
-from sympflow import (
-    ClockedFit,
-    get,
-    load,
-    max_energy_error,
-    shipped_flows,
-    solve,
-    systems,
-    train,
-)
+from sympflow import ClockedFit, HamiltonianSystem, get, load, max_energy_error, shipped_flows, solve, systems, train
 from sympflow.integrators.base import Problem
 from sympflow.integrators.clocks import PhysicalRun
 from sympflow.integrators.flows import LogSympFlow
@@ -136,3 +127,17 @@ def test_the_name_that_a_run_in_another_time_reports_is_a_name_to_call_it_by():
         solve(kepler, "log_sympflow", (0, 1), flow=3)
     with pytest.raises(TypeError, match=r"^`flow` runs in another time.* SciPy cannot drive: use solve\(\)"):
         as_scipy("sympflow", kepler, flow="kepler-log-1")
+
+
+def test_float32_and_functions_run_with_arrays():
+    kepler = systems.kepler(0.6)
+    functions = HamiltonianSystem(
+        potential=lambda q: -1 / (q**2).sum(-1).sqrt(), ndof=2, y0=kepler.y0, dt=kepler.dt, name="functions"
+    )
+    times = [0.0, 1.0, 7.0]
+    reference = solve(kepler, "log_leapfrog", (0.0, 7.0), dt=0.02, t_eval=times)
+    sol = solve(functions, "log_leapfrog", (0.0, 7.0), dt=0.02, t_eval=times)
+    np.testing.assert_allclose(sol.y, reference.y, rtol=0, atol=1e-11)
+    single = solve(kepler, "log_leapfrog", (0.0, 7.0), dt=0.02, t_eval=times, dtype="float32")
+    assert single.y.dtype == np.float32
+    np.testing.assert_allclose(single.y, reference.y, rtol=0, atol=1e-3)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import sympflow
-from sympflow.integrators import grid_runs, progress
+from sympflow.integrators import clocks, grid_runs, progress
 from sympflow.integrators.contract import Interrupted
 from sympflow.solver import solve
 from sympflow.systems import henon_heiles
@@ -102,3 +102,31 @@ def test_groups_of_parameters_are_kept_up_to_where_they_were(short_windows, monk
     assert sol.status.tolist() == [0, -1, -1]
     assert sol.message.startswith("The run was interrupted")
     np.testing.assert_array_equal(sol.y[:2][..., known[1]], whole.y[:2][..., known[1]])
+
+
+@pytest.mark.parametrize(
+    ("options", "batch"),
+    [({}, False), ({"dense_output": True}, True), ({"backend": "array"}, True), ({"events": lambda t, y: y[0]}, False)],
+    ids=["steps", "dense", "batch", "events"],
+)
+def test_ctrl_c_and_progress_on_the_logarithmic_clock(monkeypatch, options, batch):
+    monkeypatch.setattr(progress, "BETWEEN", 0.0)
+    monkeypatch.setattr(clocks, "FIRST_CHUNK", 20)
+    monkeypatch.setattr(clocks, "LARGEST_CHUNK", 600)
+    system = sympflow.systems.kepler()
+    y0 = np.array([system.y0, 1.05 * system.y0]) if batch else system.y0
+    whole, told = solve(system, "log_leapfrog", (0, 20), y0, **options), Told()
+    solve(system, "log_leapfrog", (0, 20), y0, progress=told, **options)
+    done = [part for part, _ in told]
+    assert len(done) > 3
+    assert done == sorted(done)
+    assert told[-1] == (20.0, 20.0)
+    with pytest.raises(Interrupted) as caught:
+        solve(system, "log_leapfrog", (0, 20), y0, progress=Told(10.0), **options)
+    sol = caught.value.solution
+    n, until = len(sol.t), sol.stats["interrupted_at"]
+    assert 10 <= until < 20
+    assert n > 1
+    known = sol.t <= until
+    np.testing.assert_array_equal(sol.t[known], whole.t[:n][known])
+    np.testing.assert_array_equal(sol.y[..., known], whole.y[..., :n][..., known])

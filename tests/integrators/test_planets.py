@@ -8,6 +8,7 @@ from scipy.integrate import solve_ivp
 import sympflow
 from sympflow import HamiltonianSystem, gali, lyapunov, solve, splitting_method, systems
 from sympflow.arrays import jvp
+from sympflow.kernels.protocol import RunCheckpoint
 from sympflow.schemes import CORRECTORS, corrector_maps
 
 EPS = np.finfo(float).eps
@@ -364,3 +365,20 @@ def test_usual_steps_of_the_solar_system_are_warned_of_and_right(dt):
     with pytest.warns(RuntimeWarning, match=f"`dt` {dt:g} is long .* more than a twentieth of the period of body 1"):
         found = solve(system, "wisdom_holman", (0, 3652.5), dt=dt, corrector=17, t_eval=[3652.5]).y[3:6, 0]
     assert np.linalg.norm(found - right) < 1e-5 * np.linalg.norm(right)
+
+
+@pytest.mark.parametrize("compensated", [False, True])
+def test_threads_share_bodies_without_mass(compensated):
+    rng, n = np.random.default_rng(0), 50
+    orbits = {"a": [5.2, 9.55, *rng.uniform(2.0, 4.0, n)], "e": 0.05, "M": rng.uniform(0, 6, n + 2)}
+    for encounter in (None, 1.0):
+        system = HamiltonianSystem.planets([1.0, 1e-3, 3e-4, *[0.0] * n], elements=orbits, G=GAUSS, encounter=encounter)
+        kernel = sympflow.get("wisdom_holman")(dt=40.0).composed(system).kernel(compensated)
+        runs = []
+        for threads in (1, 3):
+            carry = RunCheckpoint()
+            first = kernel.run(40.0, system.y0, 300, np.arange(0, 300, 50), carry, threads=threads)
+            last = kernel.run(40.0, system.y0, 600, np.arange(300, 600, 50), carry, threads=threads)
+            runs.append((first.states, last.states, last.n_finite, kernel.remark))
+        for one, other in zip(*runs, strict=True):
+            assert np.array_equal(one, other, equal_nan=not isinstance(one, str))

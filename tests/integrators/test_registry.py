@@ -168,3 +168,10 @@ def test_plugins_are_compared_under_the_name_that_was_asked_for(plugins):
     assert [row.method for row in report.rows] == ["good", "good", "mine", "mine", "verlet"]
     assert [row.label for row in report.rows] == ["good", "good (dt=0.1)", "mine", "mine #2", "verlet"]
     assert "No volume: `method` 'good' of the plug-in" in report.rows[0].reason  # its NumPy step takes no tensors
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_shadowing_plugin_is_skipped_where_warnings_are_errors(plugins, caplog):
+    assert "good" in available()
+    assert "The integrator 'verlet' of" in caplog.text
+    assert get("verlet").__name__ != "SymplecticEuler"

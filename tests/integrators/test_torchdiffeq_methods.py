@@ -1,5 +1,7 @@
 """torchdiffeq's solvers behind `solve`: the same numbers as torchdiffeq, and the contract of every method."""
 
+import re
+
 import numpy as np
 import pytest
 import torch
@@ -86,3 +88,8 @@ def test_a_batch_of_which_one_fails_keeps_the_dense_output_of_the_others():
     assert "Trajectory 1: torchdiffeq stopped after t = 5.4" in sol.message
     np.testing.assert_allclose(sol.sol(4.0), sol.y[..., 0], atol=64 * EPS)
     assert np.isnan(sol.y[1, :, 1]).all()
+
+
+def test_methods_that_carry_a_slope_have_no_volume_to_measure():
+    with pytest.raises(TypeError, match="not a one-step map"):
+        volume_error(solve(HH, "adaptive_heun", (0, 1), rtol=1e-3, atol=1e-3))

@@ -1,5 +1,7 @@
 """Derivatives and transforms of torch through `odeint`, `solve` and flows: right, or refused, never silently zero."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 import torch
@@ -120,6 +122,16 @@ class TestNumbersOfH:
     def end(self, k, method="verlet"):
         return odeint(self.system(k), self.y0, T, method=method, options={"dt": 0.1})[-1]
 
+    @pytest.mark.parametrize("derivative", [jacfwd, jacrev, lambda f: partial(tangent_along_ones, f)])
+    def test_derivatives_by_a_mass(self, derivative):
+        def end(mass):
+            system = HamiltonianSystem(lambda q: torch.cos(q).sum(-1), ndof=1, mass=mass)
+            return odeint(system, self.y0, T, method="verlet", options={"dt": 0.1})[-1]
+
+        mass, small = torch.tensor(1.3, dtype=torch.float64), 1e-5
+        differences = (end(mass + small) - end(mass - small)) / (2 * small)
+        torch.testing.assert_close(derivative(end)(mass), differences, rtol=0, atol=1e-8)
+
 
 class TestEvents:
     def event(self, y, method="verlet"):
@@ -235,3 +247,15 @@ class TestBatchesUnderVmap:
             vmap(problem("verlet")[1])(bad)
         with pytest.raises(ValueError, match=r"^`y0` must be finite"):
             vmap(problem("verlet")[0])(bad)
+
+
+def test_the_state_at_a_terminal_event_of_solve_says_that_it_has_no_derivative():
+    def crossing(t, y):
+        return y[0] - 0.9
+
+    crossing.terminal = True
+    with pytest.warns(UserWarning, match="carries no derivative.*odeint_event"):
+        jacfwd(lambda y: solve(PENDULUM, "verlet", (0.0, 5.0), y, events=crossing).y)(Y[0])
+    with pytest.warns(UserWarning, match="carries no derivative.*odeint_event"):
+        solve(PENDULUM, "verlet", (0.0, 5.0), Y[0].clone().requires_grad_(True), events=crossing)
+    assert solve(PENDULUM, "verlet", (0.0, 5.0), Y[0], events=crossing).status == 1

@@ -226,6 +226,14 @@ class TestRegistration:
         torch.testing.assert_close(theirs[0], ours[0])
         torch.testing.assert_close(theirs[1], ours[1])
 
+    def test_gradients_and_the_adjoint(self):
+        y0 = times(1.0, 0.2).requires_grad_(True)
+        register("verlet")  # again: it is ours already
+        t = times(0.0, 0.33)
+        assert torch.autograd.gradcheck(lambda y: torchdiffeq.odeint(PENDULUM, y, t, method="verlet"), (y0,))
+        with pytest.raises(ValueError, match=r"^`method` 'verlet' cannot be used with torchdiffeq's own odeint_adj"):
+            torchdiffeq.odeint_adjoint(PENDULUM, y0, times(0.0, 0.33), method="verlet", adjoint_params=())
+
 
 def right_hand_side(t, y):
     return torch.stack([y[1], -torch.sin(y[0])])
@@ -355,3 +363,15 @@ test_registrations_that_are_refused = refusals(
 def test_tolerances_have_no_effect_and_say_so():
     with pytest.warns(UserWarning, match="`rtol` and `atol` have no effect"):
         odeint(PENDULUM, times(1.0, 0.0), times(0.0, 1.0), method="verlet", rtol=1e-3)
+
+
+def test_everything_else_is_handed_on():
+    y0, t = torch.tensor(HH.y0), times(0.0, 1.0, 2.0)
+    assert torch.equal(odeint(HH, y0, t), torchdiffeq.odeint(HH, y0, t))
+    settings = {"method": "rk4", "options": {"step_size": 0.1}}
+    assert torch.equal(odeint(HH, y0, t, **settings), torchdiffeq.odeint(HH, y0, t, **settings))
+    q, p = odeint(HH, (y0[:2], y0[2:]), t, method="dopri5")  # a HamiltonianSystem takes the pair, too
+    torch.testing.assert_close(torch.cat([q, p], -1), torchdiffeq.odeint(HH, y0, t), rtol=1e-5, atol=1e-5)
+    module = torch.nn.Linear(4, 4).double()
+    theirs = torchdiffeq.odeint_adjoint(lambda t, y: module(y), y0, t, adjoint_params=())
+    assert torch.equal(odeint_adjoint(lambda t, y: module(y), y0, t, adjoint_params=()), theirs)
