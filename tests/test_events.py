@@ -294,3 +294,17 @@ class TestAnInfiniteEnd:
     def test_without_a_terminal_event_it_is_refused(self, events):
         with pytest.raises(ValueError, match=r"^`t_span` must be finite; .*or pass a terminal event"):
             solve(OSCILLATOR, "rk45", (0, np.inf), [1.0, 0.0], events=events)
+
+
+@pytest.mark.filterwarnings("ignore:`dt` .* is too long")
+def test_of_several_events_in_a_step_the_first_terminal_one_counts():
+    """One step of length 1; zeros at 0.3, 0.5 and 0.7, given out of order."""
+    events = [
+        event(lambda t, y: t - 0.7, terminal=True),
+        event(lambda t, y: t - 0.5, terminal=True),
+        lambda t, y: t - 0.3,
+        lambda t, y: t - 0.6,
+    ]
+    sol = solve(OSCILLATOR, "verlet", (0, 3), START, dt=1.0, events=events)
+    assert [t.tolist() for t in sol.t_events] == [[], [pytest.approx(0.5)], [pytest.approx(0.3)], []]
+    assert sol.y_events[0].shape == (0, 2)

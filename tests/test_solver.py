@@ -2,6 +2,7 @@
 
 import pickle
 import re
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -220,3 +221,14 @@ def test_solution_has_the_fields_of_scipy():
     np.testing.assert_array_equal(np.concatenate([ours.q, ours.p]), ours.y)
     with pytest.raises(ValueError, match=r"^`solution` is a batch"):
         solve(PENDULUM, "verlet", (0, 1), y0=[[1.0, 0.0]]).to_scipy()
+
+
+def test_a_million_steps_store_what_was_asked_for():
+    solve(PENDULUM, "verlet", (0, 1), dt=1e-2)
+    tracemalloc.start()
+    sol = solve(PENDULUM, "verlet", (0, 1e4), dt=1e-2, t_eval=np.linspace(0, 1e4, 11))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert sol.stats["n_steps"] == 1_000_000
+    assert sol.y.shape == (2, 11)
+    assert peak < 2e6  # storing every state would take 16 MB

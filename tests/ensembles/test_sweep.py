@@ -226,26 +226,3 @@ def test_states_are_drawn_alike_in_any_chunks():
 
     for y0 in (SYSTEM.domain, lambda rng, n: 0.1 * rng.standard_normal((n, 4))):
         assert np.array_equal(drawn(y0, 5000), drawn(y0, 999))
-
-
-@pytest.mark.parametrize(("method", "options"), [("verlet", {"backend": "array"}), ("dop853", {})])
-def test_the_same_bits_where_python_runs(method, options):
-    def final(chunk):
-        return sympflow.ensemble(SYSTEM, method, (0, 1), STATES[:80], reduce="final", chunk=chunk, **options).final
-
-    reference = final(80)
-    for chunk in (1, 7, 64):
-        assert np.array_equal(final(chunk), reference)
-
-
-class Wrong(reductions.Final):
-    def fields(self, problem):
-        return {"count": ((), np.dtype(int))}
-
-    def reduce(self, chunk):
-        return {"count": np.full(len(chunk), 1.5)}
-
-
-def test_a_reduction_returns_what_it_tells():
-    with pytest.raises(TypeError, match="`reduce` returns count as float64, which its `fields` told as int64"):
-        kept(reduce=Wrong())

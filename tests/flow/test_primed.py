@@ -7,7 +7,7 @@ from conftest import FULL_MASS_MATRIX, tampered
 from conftest import RELATIVISTIC as RELATIVISTIC_H
 
 import sympflow
-from sympflow import HamiltonianSystem, SympFlow, get, solve, systems, train
+from sympflow import HamiltonianSystem, SympFlow, get, systems, train
 from sympflow.kernels.splitting_loops import splitting_loops
 from sympflow.schemes import SCHEMES, Scheme
 
@@ -210,14 +210,3 @@ def test_asymmetric_schemes_make_no_palindrome():
 
 
 # energy over long times -------------------------------------------------------------------------------------------
-
-
-def test_steps_that_begin_with_a_kick_are_verlets():
-    """Half of the first and the last kick belong to each step, and a palindrome of four kicks has three numbers."""
-    system = systems.quartic()
-    flow = SympFlow.primed(system, 4, dt=0.4, first="kick", curvature=True)
-    y0 = system.domain.sample(5, seed=0)
-    expected = solve(system, "verlet", (0, 0.4), y0, dt=0.1).y[..., -1]
-    np.testing.assert_allclose(flow(0.4, torch.tensor(y0)).detach().numpy(), expected, atol=8 * EPS)
-    assert flow.kernel_scheme().force_evaluations == 4
-    assert flow.curvatures.free.numel() == 3 * len(flow.curvatures.exponents)

@@ -9,7 +9,7 @@ from conftest import refusals
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sympflow import Ball, Box, EnergySublevel, HamiltonianSystem, Tube, systems
+from sympflow import Ball, Box, EnergySublevel, Tube, systems
 from sympflow.hamiltonian.domain import domain_from_dict
 
 
@@ -161,13 +161,3 @@ def test_compiled_code_agrees_on_what_lies_in_a_sublevel(system, slack):
         assert all_within(system, domain, x, slack) == expected.all()
     other = domain.attach(system.symbols.hamiltonian)
     assert not all_within(system, other, inside, slack)  # an H of its own, which is not compiled
-
-
-def test_a_tube_takes_a_solution_and_serves_a_system():
-    from sympflow import solve
-
-    sol = solve(systems.henon_heiles(), "verlet", (0, 10))
-    tube = Tube(sol.states, 0.01)
-    system = HamiltonianSystem.from_sympy(systems.henon_heiles().symbols.H, domain=tube)
-    assert system.domain.contains(sol.states).all()
-    assert "201 states" in repr(tube)

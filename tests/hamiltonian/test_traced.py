@@ -369,32 +369,3 @@ def test_programs_can_be_read_and_pickled():
     branches = HamiltonianSystem(lambda q: q[..., 0] if q.sum() > 0 else -q[..., 0], ndof=1)
     with pytest.raises(ValueError, match=r"has no program, .*: it branches on a value: write np\.where"):
         _ = branches.program
-
-
-SUMS = {
-    "plain": (lambda q, p: (p**2 / M[:2]).sum(-1) / 2 + (q**4).sum(-1) / 4, "p1**2/2 + p2**2/4 + (q1**4 + q2**4)/4"),
-    "joint": (lambda q, p: 0.5 * (p @ np.array([[2.0, 0.5], [0.5, 1.0]]) * p + q**2).sum(-1),
-              "p1**2 + p1*p2/2 + p2**2/2 + (q1**2 + q2**2)/2"),
-    "relativistic": (lambda q, p: torch.sqrt(1 + (p**2).sum(-1)) + torch.cos(q[..., 0]) + q[..., 1] ** 2,
-                     "sqrt(1 + p1**2 + p2**2) + cos(q1) + q2**2"),
-    "shifted": (lambda q, p: ((p - 0.3) ** 2).sum(-1) / 2 - (q**2).sum(-1) / 2,
-                "((p1 - 0.3)**2 + (p2 - 0.3)**2)/2 - (q1**2 + q2**2)/2"),
-    "infinite at rest": (lambda q, p: (p * np.log(p) + q**2).sum(-1), "p1*log(p1) + p2*log(p2) + q1**2 + q2**2"),
-    "driven": (lambda t, q, p: (p**2).sum(-1) / 2 + np.sin(t) * q[..., 0] + (q**2).sum(-1),
-               "(p1**2 + p2**2)/2 + sin(t)*q1 + q1**2 + q2**2"),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("name", SUMS)
-def test_a_sum_in_one_function_is_separable_as_it_is_by_text(name):
-    function, text = SUMS[name]
-    driven = name == "driven"
-    found = HamiltonianSystem(hamiltonian=function, ndof=2, y0=Y0, time=driven)
-    expected = HamiltonianSystem.from_sympy(text, y0=Y0, time="t" if driven else None)
-    assert (found.separable, found.quadratic_kinetic) == (True, expected.quadratic_kinetic)
-    time = (0.3,) * driven
-    np.testing.assert_allclose(found.hamiltonian(Y0, *time), expected.hamiltonian(Y0, *time), rtol=1e-15)
-    for method in ("verlet", "kahan_li8", "tao4", "gauss_legendre4"):
-        for backend in ("compiled", "array"):
-            ends = [solve(s, method, (0, 1), dt=0.1, backend=backend).y[:, -1] for s in (found, expected)]
-            np.testing.assert_allclose(*ends, rtol=0, atol=1e-13)

@@ -1,7 +1,5 @@
 """torchdiffeq's solvers behind `solve`: the same numbers as torchdiffeq, and the contract of every method."""
 
-import re
-
 import numpy as np
 import pytest
 import torch

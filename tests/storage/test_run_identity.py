@@ -219,3 +219,18 @@ def test_a_store_is_of_one_system_and_what_cannot_be_known_is_vouched_for(tmp_pa
     with pytest.raises(TypeError, match="`same` must be True or False"):
         run("b", system_of(1.0), resume=True, same="yes")
     assert "sympflow_run" in Store.open(tmp_path / "a").attributes or call == "ensemble"
+
+
+def helped(t, y):
+    return largest(t, y) if len(t) else OFFSET
+
+
+@pytest.mark.parametrize("function", [largest, helped, lambda: helped])
+def test_functions_are_known_by_the_globals_that_they_and_their_helpers_name(monkeypatch, function):
+    before = digest(function)
+    monkeypatch.setitem(globals(), "OFFSET", 1.0)
+    assert digest(function) != before
+    monkeypatch.setitem(globals(), "OFFSET", 0.0)
+    assert digest(function) == before
+    monkeypatch.setattr(largest, "__defaults__", (2.0,))
+    assert digest(function) != before

@@ -2,6 +2,7 @@
 
 import errno
 import os
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -111,3 +112,38 @@ def test_one_writer_at_a_time(tmp_path):
         pass
     with store.locked():
         pass
+
+
+def test_damage_is_told(tmp_path):
+    store = made(tmp_path / "run.zarr")
+    chunk = tmp_path / "run.zarr" / "dof" / "0"
+    data = bytearray(chunk.read_bytes())
+    data[9] ^= 1
+    chunk.write_bytes(bytes(data))
+    with pytest.raises(StoreError, match="is damaged: 0 of 'dof'"):
+        store.read("dof")
+    chunk.write_bytes(b"")
+    with pytest.raises(StoreError, match="is damaged"):
+        store.read("dof")
+    chunk.unlink()
+    with pytest.raises(StoreError, match="is damaged: 0 of 'dof' is missing"):
+        store.committed("dof", (0,))
+    store.commit(state={"place": np.ones(3)})
+    (state,) = (tmp_path / "run.zarr").glob(".state-*")
+    state.write_bytes(state.read_bytes()[:40])
+    with pytest.raises(StoreError, match="is damaged: its state"):
+        store.state()
+
+
+def test_of_two_that_make_a_store_at_once_one_does(tmp_path, monkeypatch):
+    rename = module.os.rename
+
+    def late(made_by_us, place):
+        shutil.copytree(made_by_us, place)
+        rename(made_by_us, place)
+
+    monkeypatch.setattr(module.os, "rename", late)
+    with pytest.raises(FileExistsError, match=r"`store` '.*run.zarr' exists"):
+        made(tmp_path / "run.zarr")
+    assert [path.name for path in tmp_path.iterdir()] == ["run.zarr"]
+    assert set(Store.open(tmp_path / "run.zarr").fields) == set(FIELDS)

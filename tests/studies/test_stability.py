@@ -1,5 +1,6 @@
 """stability(): the limits that are known, blow-ups told apart, and what is refused."""
 
+import json
 import re
 
 import numpy as np
@@ -157,3 +158,44 @@ def test_a_limit_that_is_not_found_is_explained_and_progress_names_every_step():
         "ω = 1: verlet, float64, longest stable step: dt",
     ):
         assert any(text in line for line in said)
+
+
+@pytest.mark.parametrize(
+    ("method", "options"),
+    [
+        *(("verlet", options) for options in ({}, {"t_eval": [9.0]}, {"backend": "array"}, {"dense_output": True})),
+        *(("rk45", {}), ("rk45", {"dense_output": True})),
+    ],
+)
+def test_each_trajectory_of_a_batch_has_its_blow_up_time(method, options):
+    """Both ways in time, whatever is asked for: the estimate is that of the trajectory alone."""
+    system = systems.henon_heiles()
+    y0 = np.array([[0, 0, 0, 0.7], system.y0, [0, 0, 0, 0.71]])
+    sol = solve(system, method, (0, 9), y0, **options)
+    assert sol.status.tolist() == [-1, 0, -1]
+    times = sol.stats["blow_up_time"]
+    assert np.isnan(times[1])
+    assert abs(times[0] - SINGULARITY) < 1e-8
+    alone = solve(system, method, (0, 9), y0[2], **options)
+    assert abs(alone.stats["blow_up_time"] - times[2]) < 1e-8
+    assert "The solution of trajectory 0 itself becomes infinite" in sol.message
+    y0[:, 2:] *= -1  # time runs backwards
+    back = solve(system, method, (9, 0), y0, **{**options, "t_eval": [0.0]})
+    np.testing.assert_allclose(9 - back.stats["blow_up_time"], times, rtol=0, atol=1e-8)
+
+
+def test_a_flow_in_another_time_is_run_at_fractions_of_its_own_step():
+    flow = sympflow.get("sympflow")(flow="kepler-log-1")
+    report = stability(systems.kepler(0.6), [flow], metrics=("energy",), min_steps=20, max_steps=200)
+    dt = solve(systems.kepler(0.6), flow, (0, 1)).stats["dt"]
+    assert [(row.dt, row.status) for row in report.rows] == [(dt * f, "stable") for f in (0.25, 0.5, 1.0)]
+    assert report.limits[0].stable == dt
+
+
+def test_json_holds_the_rows_and_the_limits(tmp_path):
+    report = stability(systems.harmonic_oscillator(), ["verlet"], steps=[1.0, 3.0], metrics=("energy",))
+    content = json.loads(report.to_json(tmp_path / "x.json").read_text(), parse_constant=pytest.fail)
+    assert content["systems"] == [{"name": "harmonic_oscillator", "params": {"omega": 1.0}}]
+    assert [row["status"] for row in content["rows"]] == ["stable", "unstable"]
+    assert content["rows"][1]["energy_error"] == "inf"
+    assert content["limits"][0]["stable"] == report.limits[0].stable

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 from conftest import refusals
-from scipy.special import mathieu_a, mathieu_b
+from scipy.special import mathieu_a, mathieu_b, mathieu_cem
 
 from sympflow import floquet_multipliers, solve, systems
 from sympflow.hamiltonian.domain import domain_from_dict
@@ -81,3 +81,11 @@ test_bad_parameters = refusals(
     (lambda: systems.fodo_cell(quadrupole=1 / 3), r"^`drift` 2.0 and half the `quadrupole` .* multiple"),
     (lambda: systems.kicked(modes=0), r"^`modes` must be a whole number"),
 )
+
+
+def test_a_periodic_orbit_of_the_paul_trap_is_a_mathieu_function():
+    q, t = 0.4, np.linspace(0, 10, 6)
+    system = systems.paul_trap(float(mathieu_a(0, q)), q)
+    exact = mathieu_cem(0, q, np.degrees(t))[0]
+    sol = solve(system, "kahan_li8", (0, 10), [exact[0], 0, 0, 0], t_eval=t, backend="array")
+    np.testing.assert_allclose(sol.y[0], exact, atol=1e-12)

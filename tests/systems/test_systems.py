@@ -168,3 +168,40 @@ test_bad_parameters_are_named = refusals(
     (lambda: systems.spring_pendulum(coordinates="spherical"), "^`coordinates` must be"),
     (lambda: systems.spring_pendulum(radial_energy=-1), "^`radial_energy` must be"),
 )
+
+
+@pytest.mark.parametrize("n", [2, 3, 5])
+def test_the_toda_lattice_keeps_the_eigenvalues_of_laxs_matrix(n):
+    system = systems.toda_lattice(n)
+    sol = solve(system, "kahan_li8", (0, 50), backend="compiled" if n == 2 else "array")
+    eigenvalues = systems.lax_eigenvalues(sol.states)
+    assert np.ptp(sol.y[:n], axis=1).min() > 0.5  # it moves
+    np.testing.assert_allclose(eigenvalues, np.broadcast_to(eigenvalues[0], eigenvalues.shape), atol=1e-11)
+    np.testing.assert_allclose(eigenvalues.sum(-1), 0, atol=1e-12)
+    if n > 2:
+        np.testing.assert_allclose((eigenvalues**2).sum(-1), (system.hamiltonian(system.y0) + n) / 2, rtol=1e-11)
+    assert system.domain.contains(sol.states).all()
+
+
+def test_a_charged_particle_gyrates_and_is_reflected():
+    """Frequency B in the plane q₃ = 0, the speed's along the axis; the moment is an adiabatic invariant."""
+    system = systems.charged_particle()
+    B, v = 10.0, 1.0
+    t = np.linspace(0, 2, 9)
+    start = system.y0 * [1, 1, 1, 1, 1, 0]
+    flat = solve(system, "dop853", (0, 2), start, t_eval=t, rtol=1e-12, atol=1e-13).y
+    np.testing.assert_allclose(flat[:2], [0.6 - 0.1 * np.cos(B * t), 0.1 * np.sin(B * t)], atol=1e-10)
+
+    circle = np.array([v / B, 0, 0, 0, -v / 2, 1e-4])  # v₂ = p₂ − Bq₁/2 = −v: clockwise about the axis
+    near = solve(system, "dop853", (0, 2), circle, t_eval=t, rtol=1e-12, atol=1e-15).y
+    np.testing.assert_allclose(near[2], 1e-4 / v * np.sin(v * t), atol=1e-10)
+
+    sol = solve(system, "dop853", (0, 20), rtol=1e-11, atol=1e-12)
+    moments = systems.magnetic_moment(system, sol.states)
+    assert moments[0] == pytest.approx(1 / (2 * B))
+    assert np.ptp(moments) < 0.06 * moments[0]
+    assert sol.y[2].max() == pytest.approx(0.5, abs=0.1)  # μB(1 + q₃²) is the whole energy
+    np.testing.assert_allclose(sol.y[0] * sol.y[4] - sol.y[1] * sol.y[3], 0.5 * 3.5, rtol=1e-9)
+    assert system.domain.contains(sol.states).all()
+    with pytest.raises(ValueError, match=r"^`system` must be charged_particle"):
+        systems.magnetic_moment(systems.quartic(), np.zeros(4))

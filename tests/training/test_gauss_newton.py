@@ -8,9 +8,11 @@ import torch
 
 import sympflow
 from sympflow import HamiltonianSystem, SympFlow, get, solve, systems, train
+from sympflow.flow.scaling import Scaling
+from sympflow.training.fits import PrimedFit
 from sympflow.training.least_squares import levenberg_marquardt
-from sympflow.training.points import Labels
-from sympflow.training.table_fit import TableFit
+from sympflow.training.points import Labels, Stream, states
+from sympflow.training.table_fit import Table, TableFit, TableRun
 from sympflow.training.table_step import TableStep
 
 HH, PENDULUM = systems.henon_heiles(), systems.pendulum()
@@ -212,3 +214,40 @@ def test_a_checkpoint_is_there_before_the_first_search_ends(tmp_path, monkeypatc
         train(PENDULUM, flow=start, checkpoint=path, **options)
     resumed = train(PENDULUM, flow=start, resume=path, **options)
     assert all(torch.equal(v, resumed.state_dict()[k]) for k, v in whole.state_dict().items())
+
+
+FEW = PrimedFit(points=5, label_times=3, frozen_weight=1.0, energy_weight=7.0)
+
+
+LABELS = Labels.of(PENDULUM, states(PENDULUM.domain, 5, 0, Stream.RESIDUAL), 0.8 * np.arange(1, 4) / 3)
+
+
+def check_derivatives(problem, theta, tolerance):
+    """The residuals of a problem, whose Jacobian is compared with differences."""
+    r, J = problem.linearized(theta)
+    np.testing.assert_allclose(r, problem.residuals(theta), atol=1e-15)
+    for i, e in enumerate(1e-6 * np.eye(len(theta))):
+        slope = (problem.residuals(theta + e) - problem.residuals(theta - e)) / 2e-6
+        np.testing.assert_allclose(J[:, i], slope, atol=tolerance)
+    return r
+
+
+def errors_of(psi):
+    """The residuals by definition, of coordinates and of the energy, for ψ̄ at labels (3, 5, 2) of the pendulum."""
+    y = LABELS.y
+    spread = np.std(PENDULUM.hamiltonian(LABELS.x))
+    energy = math.sqrt(7.0) / spread * (PENDULUM.gradient(y) * (psi - y)).sum(-1)
+    return np.concatenate([np.moveaxis(psi - y, -1, -2), energy[:, None]], axis=1).ravel() / math.sqrt(15)
+
+
+@pytest.mark.parametrize("options", [{}, {"palindromic": False}, {"processor": 2}], ids=str)
+def test_the_fits_derivatives(options):
+    """Residuals and Jacobian by the flow's parameters, against the flow itself."""
+    flow = SympFlow.primed(PENDULUM, 2, degree=3, dt=0.8, **options).requires_grad_(False)
+    run = TableRun(flow, PENDULUM, PENDULUM.domain, Scaling.unit(1), FEW)
+    table = Table(flow)
+    theta = table.parameters() + 0.02 * np.random.default_rng(0).normal(size=flow.n_parameters)
+    r = check_derivatives(run.whole, theta, 1e-9)
+    table.assign(theta)
+    executed = torch.stack([flow.psi(float(t), torch.as_tensor(LABELS.x)) for t in LABELS.t])
+    np.testing.assert_allclose(r, errors_of(executed.numpy()), atol=1e-14)

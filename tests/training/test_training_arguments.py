@@ -8,6 +8,7 @@ import torch
 
 import sympflow
 from sympflow import HamiltonianSystem, SympFlow, systems, train
+from sympflow.training import checkpoint as checkpoints
 from sympflow.training import trials
 from sympflow.training.fits import (
     BFGS,
@@ -22,6 +23,7 @@ from sympflow.training.fits import (
     SplitFit,
     keywords,
 )
+from sympflow.training.table_fit import TableRun
 
 HH, PENDULUM, OSCILLATOR = systems.henon_heiles(), systems.pendulum(), systems.harmonic_oscillator()
 BOX = sympflow.Box([-1.0, -1.0], [1.0, 1.0])
@@ -214,3 +216,29 @@ def test_a_fit_makes_its_own_split_flow_or_clock():
     assert (type(flow).__name__, flow.dt, flow.recipe["stages"][0]["restarts"]) == ("SplitFlow", 0.05, 1)
     flow = train(systems.kepler(0.6), ClockedFit(0.5, points=20, label_times=3, terms=4))
     assert (type(flow).__name__, flow.figures["step"]) == ("ClockedFlow", 0.5)
+
+
+class Started(Exception):
+    pass
+
+
+def test_a_run_of_trials_is_resumed_whatever_else_is_said_now(monkeypatch, tmp_path):
+    """A short budget, and the default of its fit, say nothing of its flow."""
+    path, start = tmp_path / "run.ckpt", trials.tried_starts(HH, HH.domain)[-1]
+    assert start.curvature
+
+    def kill(*_):
+        raise Started
+
+    with monkeypatch.context() as patch, pytest.raises(Started):
+        patch.setattr(TableRun, "next_minimum", kill)
+        train(HH, flow=start.flow(HH), checkpoint=path, progress=False)
+    assert checkpoints.read(path)["step"] == 0
+    monkeypatch.setattr(TableRun, "go", kill)
+    for options in ({}, {"time_budget": 30.0}, {"time_budget": 30.0, "loss": "labels"}, {"time_budget": 90.0}):
+        with pytest.raises(Started):
+            train(HH, resume=path, progress=False, **options)
+    with pytest.raises(ValueError, match=r"^`resume` is a run with another restarts"):
+        train(HH, resume=path, restarts=3, progress=False)
+    with pytest.raises(ValueError, match=r"^`resume` is a run with another architecture: .* arguments of the flow"):
+        train(HH, stages=2, resume=path, progress=False)

@@ -181,3 +181,10 @@ def test_other_systems_get_a_network():
         assert isinstance(flow, SympFlow)
         assert not isinstance(flow, PrimedFlow)
         assert flow.recipe["stages"][0]["optimizer"] == "adam"
+
+
+def test_a_resumed_run_with_other_data_is_refused(tmp_path):
+    t, x, y = labels(20)
+    train(HH, data=(t, x, y), steps=2, checkpoint=tmp_path / "run.ckpt", optimizer="gauss-newton", **QUICK)
+    with pytest.raises(ValueError, match="`resume` is a run with another data"):
+        train(HH, data=(t, x, y * (1 + 1e-6)), steps=2, resume=tmp_path / "run.ckpt", optimizer="gauss-newton", **QUICK)

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from sympflow import systems, train
+from sympflow import max_energy_error, solve, systems, train
 from sympflow.flow.mlp import MLPFlow
 from sympflow.flow.sympflow import SympFlow
 from sympflow.training import pretrained
@@ -64,3 +64,13 @@ def test_a_network_is_made_again_by_its_file(tmp_path):
     again = Recipe.of(tmp_path / "pendulum-sympflow.safetensors").fitted(progress=False)
     assert [(stage["points"], stage["steps"]) for stage in again.recipe["stages"]] == [(40, 2), (50, 1)]
     assert all(torch.equal(w, flow.state_dict()[name]) for name, w in again.state_dict().items())
+
+
+@pytest.mark.parametrize("scene", INITIAL)
+def test_shipped_sympflows_stay_for_a_hundred_thousand_steps(scene):
+    """No neuron has a slope that the figures, of 1000 steps, do not see, but a long orbit meets."""
+    recipe = recipe_of(scene)
+    system, flow = recipe.system, recipe.flow
+    y0 = [0.0, 0.1, 0.35, 0.0] if scene == "henon_heiles" else system.y0  # a regular orbit
+    sol = solve(system, flow, (0.0, 1e5 * flow.dt), y0=y0, save_every=100, on_domain_exit="ignore")
+    assert max_energy_error(sol) <= 1e-4
