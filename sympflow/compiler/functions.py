@@ -40,6 +40,10 @@ class Function:
         import torch
 
         function = getattr(torch, self.tensor) if isinstance(self.tensor, str) else self.tensor
+        if function is torch.pow and isinstance(
+            args[1], float
+        ):  # as a tensor it would have a derivative, NaN for x < 0
+            return torch.pow(*args)
         return function(*_alike(args))
 
 
