@@ -293,10 +293,11 @@ class TracedHamiltonian:
         arrays = (x, *more)
         columns = [a[..., i] for a in arrays for i in range(a.shape[-1])]
         times = t[: self.time is not None]
-        if is_tensor(x):
-            times = tuple(beside(s, x) for s in times)
-        with np.errstate(all="ignore"):
-            values = program(*times, *columns)
+        if is_tensor(x):  # torch.compile knows no errstate
+            values = program(*(beside(s, x) for s in times), *columns)
+        else:
+            with np.errstate(all="ignore"):
+                values = program(*times, *columns)
         return assemble(values, sum(columns[:: max(x.shape[-1], 1)]) if more else columns[0])
 
 
