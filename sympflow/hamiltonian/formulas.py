@@ -503,7 +503,7 @@ def _kinetic(M: Sequence[Sequence[Any]], p: Sequence[Any]) -> Any:
     for i, row in enumerate(M):
         for j, entry in enumerate(row):
             if not is_zero(entry):
-                total = total + (0.5 * entry) * (p[i] * p[j])
+                total = total + (0.5 * entry) * (p[i] ** 2.0 if i == j else p[i] * p[j])
     return total
 
 

@@ -120,7 +120,9 @@ def coefficients(X: Any, G: Sequence[Any], r: Any, inverse: Any, eta: Any, zeta:
     G1, G2, G3 = G1 + d * G0, G2 + d * G1, G3 + d * G2
     a = mu * G2
     f, g, df = -(a * inverse), t - mu * G3, -(mu * G1 * inverse * end)
-    dg = where(f > -0.5, fma(g, df, -f) / (1.0 + f), -(a * end))  # fg′ − f′g = 1, without a bias of rounding
+    dg = -(a * end)
+    excess = fma(f, dg, fma(-g, df, f + dg))  # of fg′ − f′g over 1, by rounding; with a bias, if it is not taken back
+    dg = dg - where(f > -0.5, fma(f, f - 1.0, 1.0), 0.0) * excess
     return [f, g, df, dg, d, r * G1 + eta * G2]
 
 
