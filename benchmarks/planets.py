@@ -394,6 +394,30 @@ def billion(store: Path, dt: float = 200.0) -> str:
     )
 
 
+def rounding(years: float = 1e6) -> str:
+    """The energy error of one planet about a star, whose motion is solved exactly, by its orbit and its step."""
+    lines = []
+    for e in (0.2, 0.5, 0.7):
+        elements = {"a": 1.0, "e": e, "inc": 0.3, "node": 1.0, "peri": 0.7, "M": 0.1}
+        system = HamiltonianSystem.planets([1.0, 1e-3], elements=elements)
+        for steps in (20.37, 81.37):  # in a period
+            n, dt = round(years * steps / 1000) * 1000, 2 * np.pi / steps
+            given = {"dt": dt, "save_every": n // 1000, "compensated": True}
+            energy = solve(system, "wisdom_holman", (0.0, n * dt), **given).energy_error()
+            spread = [f"{np.sqrt(np.mean(energy[1 : 1 + k] ** 2)):.1e}" for k in (10, 100, 1000)]
+            lines.append([f"{e:g}", f"{steps:.0f}", f"{n:.0e}", *spread])
+            print(*lines[-1], flush=True)
+    titles = [
+        "eccentricity",
+        "steps a period",
+        "steps",
+        "energy error, rms, after a hundredth of them",
+        "a tenth",
+        "all",
+    ]
+    return fragments.table(titles, lines)
+
+
 def figure(path: Path) -> None:
     """Eccentricities of the outer planets over 200,000 years."""
     import matplotlib
@@ -441,7 +465,7 @@ def main() -> None:
         fragments.write(given.out, "planets-secular", text)
         return
     if given.billion:
-        fragments.write(given.out, "planets-billion", billion(given.billion))
+        fragments.write(given.out, "planets-billion", "\n\n".join([billion(given.billion), rounding()]))
         return
     if given.long:
         fragments.write(given.out, "planets-trained", trained())

@@ -149,7 +149,7 @@ SMALL = {
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SMALL)
 def test_benchmarks_of_parts_run(name):
-    """Benchmarks in miniature, of which some use internal parts of the package."""
+    """Benchmarks in miniature. Some use internal parts of the package."""
     script = Path(again.__file__).with_name(f"{name}.py")
     done = subprocess.run([sys.executable, str(script), *SMALL[name]], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

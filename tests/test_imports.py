@@ -28,7 +28,7 @@ ALLOWED = [
     "import sympflow\nsympflow.available(); sympflow.shipped_flows()",
     "import sympflow; sympflow.solve(sympflow.systems.pendulum(), 'rk45', (0, 1))",
 ]
-"""Code, of which the fourth needs SymPy and the last SciPy, and none anything else."""
+"""Code that needs NumPy alone; the piece with `expression` needs SymPy too, and the last one SciPy."""
 
 COMPILED = [
     "sympflow.lyapunov(sympflow.systems.henon_heiles(), 'verlet', (0, 1), dt=0.1, backend='compiled')",

@@ -40,10 +40,8 @@ class Function:
         import torch
 
         function = getattr(torch, self.tensor) if isinstance(self.tensor, str) else self.tensor
-        if function is torch.pow and isinstance(
-            args[1], float
-        ):  # as a tensor it would have a derivative, NaN for x < 0
-            return torch.pow(*args)
+        if function is torch.pow and isinstance(args[1], float):
+            return torch.pow(*args)  # an exponent that is a tensor makes the gradient of a jvp NaN where x ≤ 0
         return function(*_alike(args))
 
 

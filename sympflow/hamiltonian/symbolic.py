@@ -645,7 +645,9 @@ def named_time(time: str | sp.Symbol | None, params: Mapping[str, Any]) -> sp.Sy
     if not isinstance(name, str):
         raise TypeError(f"`time` must be the name of the time in H, such as 't'; got {time!r}.")
     if not name.isidentifier() or _is_coordinate(name) or name in params or name in FUNCTIONS or name == "pi":
-        what = "a parameter" if name in params else "a coordinate" if _is_coordinate(name) else "no name of a symbol"
+        what = (
+            "a parameter" if name in params else "a coordinate" if _is_coordinate(name) else "not the name of a symbol"
+        )
         raise ValueError(f"`time` {name!r} is {what}: name the time otherwise, as time='t'.")
     return sp.Symbol(name, real=True)
 

@@ -27,7 +27,7 @@ MOST_POWER, MOST_BITS = 64, 2000
 
 
 class NotPlain(Exception):
-    """The text has parts that SymPy simplifies or judges, or is wrong, of which SymPy's reader tells."""
+    """The text is left to SymPy, which simplifies and judges its parts, and says what is wrong in it."""
 
 
 class _Reader:

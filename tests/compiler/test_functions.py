@@ -141,6 +141,14 @@ def test_a_choice_between_two_floats_is_in_double_precision(make):
     assert [float(v) for v in y] == [0.1, 0.2]
 
 
+@pytest.mark.parametrize("n", [2.0, 3.0])
+def test_a_power_has_a_gradient_of_its_jvp_where_its_base_is_not_positive(n):
+    x = torch.tensor([-0.5, 0.0, 0.3], dtype=torch.float64, requires_grad=True)
+    slope = torch.func.jvp(lambda x: apply("pow", x, n), (x,), (torch.ones_like(x),))[1]
+    (bend,) = torch.autograd.grad(slope.sum(), x)
+    np.testing.assert_allclose(bend.numpy(), n * (n - 1) * x.detach().numpy() ** (n - 2), rtol=1e-15)
+
+
 def test_not_a_number_goes_through_signs_and_extremes():
     nan = np.array([np.nan, 1.0])
     for x in (nan, torch.tensor(nan)):

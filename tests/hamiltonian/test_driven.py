@@ -168,7 +168,7 @@ test_bad_input_is_named = refusals(
     (lambda: made("p**2/2 + t*q**2"), TypeError, '^`expression` depends on the time.*time="t"'),
     (lambda: made("p**2/2 + q**2", time="t"), "^`time` is 't', which H does not"),
     (lambda: made("p**2/2 + q**2", time="q1"), "^`time` 'q1' is a coordinate"),
-    (lambda: made("p**2/2 + q**2", time="2t"), "^`time` '2t' is no name"),
+    (lambda: made("p**2/2 + q**2", time="2t"), "^`time` '2t' is not the name of a symbol"),
     (lambda: made("p**2/2 + a*q**2", params=AW, time="a"), "^`time` 'a' is a"),
     (lambda: made("p**2/2 + t*q**2", time=1), TypeError, "^`time` must be the name"),
     (lambda: made("p**2/2 + q**2", period=1), TypeError, "^`period` only goes with `time`"),
