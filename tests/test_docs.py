@@ -234,3 +234,18 @@ def test_the_table_of_where_to_add_names_what_is_there():
             name = re.search(r"`([A-Za-z_]+)`(?!.*`[A-Z_]+`)", there)
             assert name is not None, there
             assert re.search(rf"^(class |def )?{name[1]}\b", code, re.M), f"{path} has no {name[1]}"
+
+
+def test_every_image_says_what_it_shows():
+    for page in PAGES:
+        for words in re.findall(r"!\[([^\]]*)\]\(", page.read_text(encoding="utf-8")):
+            assert len(words) > 10, f"{page.name} has an image without a description"
+
+
+def test_a_figure_stands_where_it_is_or_is_rounded_from():
+    assert stands_in("3.8", ["3.79", "12"])
+    assert stands_in("1.0e-08", ["1.02e-8"])
+    assert stands_in("8,000", ["8000"])
+    assert not stands_in("3.7", ["3.79"])
+    assert not stands_in("5.4e-7", ["5.5e-07"])
+    assert figures("takes 1,243,312 steps, 2.3 to 4e-5 s") == ["1,243,312", "2.3", "4e-5"]

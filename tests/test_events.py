@@ -295,6 +295,15 @@ class TestAnInfiniteEnd:
         with pytest.raises(ValueError, match=r"^`t_span` must be finite; .*or pass a terminal event"):
             solve(OSCILLATOR, "rk45", (0, np.inf), [1.0, 0.0], events=events)
 
+    def test_of_a_method_that_is_searched_afterwards(self):
+        def third(t, y):
+            return y[0]
+
+        third.terminal = 3
+        sol = solve(systems.kepler(), "log_leapfrog", (0, np.inf), events=third, t_eval=[1.0, 2.0, 1e6])
+        assert (sol.status, sol.t.tolist(), len(sol.t_events[0])) == (1, [1.0, 2.0], 3)
+        assert 6 < sol.t_events[0][-1] < 3 * np.pi
+
 
 @pytest.mark.filterwarnings("ignore:`dt` .* is too long")
 def test_of_several_events_in_a_step_the_first_terminal_one_counts():
@@ -308,3 +317,9 @@ def test_of_several_events_in_a_step_the_first_terminal_one_counts():
     sol = solve(OSCILLATOR, "verlet", (0, 3), START, dt=1.0, events=events)
     assert [t.tolist() for t in sol.t_events] == [[], [pytest.approx(0.5)], [pytest.approx(0.3)], []]
     assert sol.y_events[0].shape == (0, 2)
+
+
+def test_a_zero_between_the_samples_of_a_flow_is_found(rotation):
+    """cos 7t has seven pairs of zeros in three steps of Δt = 1, up to three within one."""
+    sol = solve(OSCILLATOR, rotation, (0, 9), START, t_eval=[], events=lambda t, y: np.cos(7 * t) + 0 * y[0])
+    np.testing.assert_allclose(sol.t_events[0], np.pi * (np.arange(20) + 0.5) / 7, atol=1e-12)

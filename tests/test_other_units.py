@@ -8,6 +8,7 @@ import pytest
 
 import sympflow
 from sympflow import HamiltonianSystem, solve
+from sympflow.hamiltonian.fingerprint import fingerprint, same_system
 from sympflow.hamiltonian.scales import natural_scale, smallest_size
 from sympflow.metrics.reference import reference
 
@@ -249,3 +250,73 @@ def test_a_default_tolerance_hides_no_errors(method, units):
         warnings.simplefilter("error")
         np.testing.assert_allclose(end(units), end((1.0, 1.0, 1.0)), atol=5e-3)
         solve(scaled("well", units), method, y0=[0.0, 0.0])
+
+
+def by_functions(separable, a, b, c):
+    """A system of Python functions in units of (a, b, c)."""
+    E = a * b / c
+    how = {"ndof": 1, "y0": [1.0 * a, 0.3 * b], "t_span": (0.0, 2 * c), "dt": 0.05 * c}
+    if separable:
+        return HamiltonianSystem(
+            potential=lambda q: E * ((q / a) ** 2 / 2 + (q / a) ** 4 / 4).sum(-1), mass=b * b / E, **how
+        )
+    return HamiltonianSystem(
+        hamiltonian=lambda q, p: E * ((p / b) ** 2 * (1 + (q / a) ** 2) / 2 + (q / a) ** 4 / 4).sum(-1), **how
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("separable", [True, False])
+def test_systems_of_functions(separable):
+    ends, exponents = [], []
+    for units in ((1.0, 1.0, 1.0), *UNITS):
+        system = by_functions(separable, *units)
+        methods = ["gauss_legendre4", "tao4", *(["verlet", "chin4a"] if separable else [])]
+        ends.append([solve(system, m, t_eval=[system.t_span[1]]).y[:, -1] / units[:2] for m in methods])
+        followed = sympflow.lyapunov(system, methods[-1] if separable else "implicit_midpoint", backend="array")
+        exponents.append(followed.value * units[2])
+    np.testing.assert_allclose(ends[1:], np.broadcast_to(ends[0], np.shape(ends[1:])), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(exponents, exponents[0], rtol=1e-6)
+
+
+def test_bodies_have_scales_of_their_masses():
+    """A grain of dust beside a star: each momentum is compared with its own mass."""
+    system = HamiltonianSystem.pairs(
+        "-G/r", masses=[2e30, 6e24, 1e-9], dim=2, params={"G": 6.7e-11}, y0=[0, 0, 1.5e11, 0, 2e11, 0, *[0] * 6]
+    )
+    s = natural_scale(system)
+    np.testing.assert_allclose(s**2 / s[0] ** 2, np.repeat([1, 3e-6, 5e-40], 2), rtol=1e-9)
+
+
+def test_copies_that_part_are_told_in_any_units(two_bodies):
+    apart, long = "two copies that method 'tao2' keeps differ by .* change `omega`", "`dt` .* is too long"
+    with pytest.warns(RuntimeWarning, match=apart), pytest.warns(RuntimeWarning, match=long):
+        solve(two_bodies, "tao2", dt=YEAR / 4, omega=1e-3 / YEAR, backend="array")
+
+
+@pytest.mark.parametrize("units", UNITS[:2])
+@pytest.mark.parametrize("well", ["((u/a)**2 - 1)**2/4", "(1 - cos(u/a))", "cos(u/a)", "(u/a - 2)**2/2"])
+def test_states_of_lattices(well, units):
+    def drawn(a, b, c):
+        lattice = HamiltonianSystem.lattice(
+            shape=6,
+            onsite=f"E*{well}",
+            bond="E*(r/a)**2/2",
+            kinetic="E*(p/b)**2/2",
+            params={"a": a, "b": b, "E": a * b / c},
+            domain=sympflow.LatticeStates(0.1 * a * b / c),
+            fields="u",
+        )
+        return lattice.domain.sample(8, 0) / np.repeat([a, b], 6)
+
+    np.testing.assert_allclose(drawn(*units), drawn(1.0, 1.0, 1.0), atol=1e-6)  # minima are known to √ε of scales
+
+
+@pytest.mark.parametrize("a", [1e-10, 1.0, 1e11])
+def test_identities_of_bodies(a):
+    def identity(k):
+        V = "(r/a)**-12 - k*(r/a)**-6"
+        return fingerprint(HamiltonianSystem.pairs(V, masses=np.ones(3), params={"a": a, "k": k}))
+
+    assert same_system(identity(1.0), identity(1.0))
+    assert not same_system(identity(1.0), identity(1.001))

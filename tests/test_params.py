@@ -1,5 +1,6 @@
 """Batches whose trajectories have parameters of their own: `solve(..., params=...)`."""
 
+import importlib
 import pickle
 
 import numpy as np
@@ -79,6 +80,48 @@ class TestTrajectories:
             ValueError, match=r"'damping', which is not .* `damping` is not one: make a system for each value"
         ):
             solve(damped, "verlet", (0, 1), [1.0, 0.0], params={"damping": [0.1, 0.2]}, dt=0.1)
+
+    @pytest.mark.parametrize("damping", [None, [0.1, 0.3]])
+    def test_one_run_takes_drives_and_friction(self, damping, monkeypatch):
+        H = "(p1**2 + p2**2)/(2*m) + (1 + a*cos(w*t))*k*(q1**2 + q2**2)/2 - c*q1*q2"
+        drive = {"time": "t"} if damping is None else {}
+        params = {"m": 1.3, "a": 0.2, "w": 1.7, "k": 1.1, "c": 0.3}
+        if damping is not None:
+            H, params = H.replace("(1 + a*cos(w*t))*", ""), {name: params[name] for name in "mkc"}
+        system = HamiltonianSystem.from_sympy(H, params=params, damping=damping, **drive)
+        values = {"k": np.array([0.4, 2.0, 0.7]), "m": 1.3 + np.arange(3), ("c" if damping else "w"): [0.2, 0.3, 0.6]}
+        y0, options = 0.2 * np.random.default_rng(1).normal(size=(3, 4)), {"dt": 0.25, "t_eval": [0, 0.55, 2.9, 3]}
+        made, whole = [], HamiltonianSystem.with_params
+        monkeypatch.setattr(HamiltonianSystem, "with_params", lambda self, **x: made.append(x) or whole(self, **x))
+        sol = solve(system, "verlet", (0, 3), y0, params=values, backend="compiled", **options)
+        assert len(made) == 1  # for the form of all
+        for i in range(3):
+            alone = whole(system, **{name: float(value[i]) for name, value in values.items()})
+            expected = solve(alone, "verlet", (0, 3), y0[i], backend="array", **options)
+            np.testing.assert_allclose(sol.y[i], expected.y, rtol=0, atol=1e-14)
+
+    @pytest.mark.slow
+    @pytest.mark.filterwarnings("ignore:`dt` .* is too long")
+    def test_shapes_broadcast_with_those_of_the_states(self, system, y0):
+        grid = {"lam": LAM[:, None], "m": [1.0, 2.0]}
+        sol = solve(system, "verlet", (0, 1), params=grid, dt=0.25, dense_output=True)
+        assert sol.y.shape == (4, 2, 4, 5)
+        assert sol.params["m"].shape == (4, 2)
+        np.testing.assert_array_equal(sol.sol(1.0), sol.y[..., -1])
+        one = solve(
+            system.with_params(lam=LAM[3], m=2.0), "verlet", (0, 1), system.y0[None], dt=0.25, dense_output=True
+        )
+        np.testing.assert_allclose(sol.sol([0.1, 0.6])[3, 1], one.sol([0.1, 0.6])[0], rtol=0, atol=1e-15)
+        again = pickle.loads(pickle.dumps(sol))
+        np.testing.assert_array_equal(again.sol(0.6), sol.sol(0.6))
+
+    def test_each_becomes_infinite_at_its_own_time(self, system):
+        y0, lam = np.array([[0.0, 3.0, 0.0, 0.0], [0.1, 0.0, 0.0, 0.1]]), np.array([0.7, 0.7])
+        sol = solve(system, "verlet", (0, 9), y0, params={"lam": lam, "m": [1.2, 1.4]}, dt=0.01)
+        assert sol.status.tolist() == [-1, 0]
+        alone = solve(system.with_params(lam=0.7, m=1.2), "verlet", (0, 9), y0[:1], dt=0.01)
+        np.testing.assert_array_equal(sol.stats["blow_up_time"], [alone.stats["blow_up_time"][0], np.nan])
+        assert "itself becomes infinite, at about t = " in sol.message
 
 
 class TestMetrics:
@@ -180,3 +223,33 @@ def test_a_drive_of_amplitude_zero_is_none():
         solve(still, "verlet", (0, 1), params={"a": [0.0, 0.3]}, dt=0.1)
     with pytest.raises(ValueError, match="`time` is 't', which H does not depend on"):
         HamiltonianSystem.from_sympy("p**2/2 + q**2/2", time="t")
+
+
+PENDULUMS = "p1**2/(2*m) + p2**2/2 + k*(2 - cos(q1) - cos(q2)) + g*m*(q1 - q2)**4/4 + k**2*p1*w"
+
+
+@pytest.mark.parametrize("method", ["verlet", "srkn11b", "gauss_legendre4", "rk4", "dopri5"])
+def test_other_values_need_no_new_functions_and_no_new_code(method, monkeypatch):
+    H = PENDULUMS if method == "gauss_legendre4" else PENDULUMS.removesuffix(" + k**2*p1*w")
+    more = {"w": 0.1} if method == "gauss_legendre4" else {}
+    values = {"k": 1.3, "g": 0.4, "m": 1.7} | more
+    options = {"t_eval": [1.0]} | ({} if method == "dopri5" else {"dt": 0.05})
+    y0 = np.array([0.3, -0.2, 0.1, 0.4])
+    system = HamiltonianSystem.from_sympy(H, params=values)
+
+    def run(system):
+        sol = solve(system, method, (0.0, 1.0), y0, **options)
+        return sol.y, sol.energy(), system.hessian(y0), system.gradient(y0), system.inverse_mass
+
+    run(system.with_params(k=0.9))
+    changed = {"k": 0.7, "g": -1.9, "m": 2.3}
+    made = []
+    for name in ("symbolic.generate", "recorded.calculated"):
+        place, own = f"sympflow.hamiltonian.{name}", name.partition(".")[2]
+        before = getattr(importlib.import_module(place.rpartition(".")[0]), own)
+        monkeypatch.setattr(place, lambda *args, before=before, own=own: made.append(own) or before(*args))
+    found = run(system.with_params(**changed))
+    assert made == []
+    for mine, anew in zip(found, run(HamiltonianSystem.from_sympy(H, params=values | changed)), strict=True):
+        if mine is not None:
+            np.testing.assert_allclose(mine, anew, rtol=1e-12, atol=1e-14)

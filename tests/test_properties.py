@@ -10,6 +10,7 @@ from watchdog import watched
 import sympflow
 from sympflow import get, solve, systems
 from sympflow.integrators.grid import Grid
+from sympflow.integrators.methods import NAMES
 
 pytestmark = pytest.mark.slow
 
@@ -105,3 +106,80 @@ DOMAINS = [sympflow.Ball, sympflow.Box, sympflow.EnergySublevel, sympflow.Tube]
 def test_domains_are_made_or_refused(kind, a, b):
     domain = refused(lambda: kind(a, b))
     assert domain is None or kind is sympflow.EnergySublevel or np.isfinite(domain.sample(2, 0)).all()
+
+
+@some
+@given(t0=st.floats(-1e3, 1e3), dt=st.floats(1e-3, 10), n=st.integers(0, 10_000), backward=st.booleans())
+def test_n_steps_of_dt_are_n_steps(t0, dt, n, backward):
+    """⌊0.3/0.1⌋ is 2 in floating point: counts are integers, and times t0 + k·dt."""
+    sign = -1 if backward else 1
+    grid = Grid(t0, t0 + sign * n * dt, dt)
+    assert grid.n_steps == n
+    assert grid.remainder == 0
+    k = n // 2
+    assert grid.time(k) == t0 + k * grid.h
+
+
+few = settings(max_examples=15, deadline=None)
+
+
+states = hnp.arrays(float, 2, elements=st.floats(-1.2, 1.2))
+
+
+@pytest.mark.parametrize("method", ["verlet", "rk45", "dopri5", "rk4", "gauss_legendre4", "log_leapfrog", "sympflow"])
+@few
+@given(
+    y0=states,
+    times=st.lists(st.floats(0, 2, allow_subnormal=False), min_size=1, max_size=6, unique=True),
+    data=st.data(),
+)
+def test_fewer_output_times_do_not_change_the_others(method, y0, times, data):
+    times = sorted(times)
+    keep = sorted(data.draw(st.sets(st.sampled_from(range(len(times))), min_size=1)))
+    options = {"t_span": (0, 2), "y0": y0 * 0.4}  # below the energy to which the logarithmic method is set
+    everything = run(method, t_eval=times, **options)
+    subset = run(method, t_eval=[times[i] for i in keep], **options)
+    np.testing.assert_allclose(subset.y, everything.y[:, keep], rtol=1e-12, atol=1e-12)
+
+
+METHODS = sorted(m for m in NAMES if getattr(get(m), "splitting", "") != "kepler")
+
+
+FIXED = [m for m in METHODS if "dt" in get(m).options() and getattr(get(m), "on_grid", True) and not get(m).trained]
+
+
+SPLITTINGS = [m for m in FIXED if get(m).symplectic]
+
+
+@pytest.mark.parametrize("method", SPLITTINGS)
+@few
+@given(y0=states, dt=steps, n=st.integers(1, 12))
+def test_time_reversal(method, y0, dt, n):
+    """Symmetric methods on an even H: R ψ R = ψ⁻¹ with R(q, p) = (q, −p). All of them: the inverse undoes the steps."""
+    integrator = get(method)(dt=dt)
+    y = y0
+    for _ in range(n):
+        y = integrator.step(OSCILLATOR, 0.0, y, dt)
+    for _ in range(n):
+        y = integrator.inverse(OSCILLATOR, 0.0, y, dt)
+    np.testing.assert_allclose(y, y0, atol=1e-11)
+    if getattr(getattr(integrator, "scheme", None), "symmetric", False):
+        R = np.array([1.0, -1.0])
+        forward = integrator.step(OSCILLATOR, 0.0, y0, dt)
+        back = R * integrator.step(OSCILLATOR, 0.0, R * forward, dt)
+        np.testing.assert_allclose(back, y0, atol=1e-12)
+
+
+batches = hnp.arrays(float, st.tuples(st.integers(1, 4), st.just(2)), elements=st.floats(-1.2, 1.2))
+
+
+@pytest.mark.parametrize(
+    "method", ["verlet", "kahan_li8", "rk4", "rk45", "implicit_midpoint", "impulse", "mlp", "sympflow"]
+)
+@few
+@given(y0=batches, dt=steps)
+def test_a_batch_is_a_loop(method, y0, dt):
+    options = {"dt": dt} if "dt" in get(method).options() else {}
+    together = run(method, (0, 1), y0, t_eval=[0.37, 1.0], **options)
+    alone = [run(method, (0, 1), y, t_eval=[0.37, 1.0], **options).y for y in y0]
+    np.testing.assert_allclose(together.y, alone, rtol=1e-11, atol=1e-11)

@@ -232,3 +232,18 @@ def test_a_million_steps_store_what_was_asked_for():
     assert sol.stats["n_steps"] == 1_000_000
     assert sol.y.shape == (2, 11)
     assert peak < 2e6  # storing every state would take 16 MB
+
+
+def test_general_kinetic_energies():
+    masses = HamiltonianSystem.from_sympy("p1**2/4 + p1*p2/5 + p2**2/6 + q1**4 + q1*q2 + q2**2", y0=[1, 0, 0, 1])
+    relativistic = HamiltonianSystem.from_sympy("sqrt(1 + p**2) + q**4", y0=[1, 0.5])
+    for system, method, close in (
+        (masses, "kahan_li8", 1e-9),
+        (masses, "srkn11b", 1e-8),
+        (relativistic, "kahan_li8", 1e-9),
+    ):
+        reference = solve(system, "dop853", (0, 3), t_eval=[3.0], rtol=1e-12, atol=1e-13).y
+        sol = solve(system, method, (0, 3), t_eval=[3.0], backend="array")
+        np.testing.assert_allclose(sol.y, reference, rtol=0, atol=close)
+    with pytest.raises(ValueError, match=r"^`method` 'srkn11b' needs a kinetic energy"):
+        solve(relativistic, "srkn11b")

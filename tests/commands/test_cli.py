@@ -2,6 +2,7 @@
 
 import csv
 import json
+import os
 import re
 import subprocess
 import sys
@@ -374,3 +375,64 @@ def test_a_start_time_and_a_driven_formula(y0):
     q, p = 5 - np.cos(3.0) - np.sin(3.0), 1 + np.sin(3.0) - np.cos(3.0)  # q = t − cos(t − 2) − sin(t − 2)
     found = re.search(r"y\(5\) = \[(.*), (.*)\]", said)
     np.testing.assert_allclose([float(x) for x in found.groups()], [q, p], atol=1e-7)
+
+
+def test_solve_that_fails_ends_with_status_one():
+    result = run("solve", "henon-heiles", "--method", "verlet", "--y0", "0,0,0,0.7", "--t-end", 20)
+    assert result.exit_code == 1
+    assert "became non-finite after t = 5." in result.output
+
+
+@pytest.mark.slow
+def test_train_writes_a_flow_that_solve_takes(tmp_path):
+    path = tmp_path / "flow.safetensors"
+    small = ["--pairs", 1, "--hidden", "4", "--epochs", 3, "--points", 40, "--seed", 1, "--dt", 0.2]
+    result = run("train", "pendulum", *small, "--out", path, "--checkpoint", tmp_path / "run.pt")
+    assert result.exit_code == 0, result.output
+    assert "one step error" in result.output
+    assert run("train", "pendulum", *small, "--out", path, "--resume", tmp_path / "run.pt").exit_code == 0
+    result = run("solve", "pendulum", "--method", path, "--t-end", 1, "--out", tmp_path / "y.csv")
+    assert result.exit_code == 0, result.output
+    assert len((tmp_path / "y.csv").read_text().splitlines()) == 7
+    result = run("compare", "pendulum", "--methods", f"{path},verlet", *FAST)
+    assert result.exit_code == 0
+    assert "flow  " in result.output
+
+
+def test_quiet_prints_errors_alone(tmp_path):
+    words = ("solve", "pendulum", "--method", "verlet", "--t-end", 1, "--out", tmp_path / "y.csv")
+    quiet = run(*words, "--quiet")
+    assert (quiet.exit_code, quiet.output) == (0, "")
+    assert (tmp_path / "y.csv").exists()
+    assert "outputs" in run(*words).stdout  # it is not kept for the next command
+    for command in (("compare", "--metrics", "energy", *FAST), ("section", "--t-end", 5), ("flows",), ("systems",)):
+        names = () if command[0] == "systems" else ("pendulum",)
+        methods = {"compare": ("--methods", "verlet"), "section": ("--method", "verlet")}.get(command[0], ())
+        assert run(command[0], *names, *methods, *command[1:], "-q").output == ""
+    refused = run("solve", "pendulum", "--method", "vertel", "-q")
+    assert refused.stdout == ""
+    assert "Did you mean 'verlet'" in refused.stderr
+
+
+def test_solve_takes_a_formula_and_the_values_of_its_symbols():
+    formula = ("p**2/2 + k*q**4/4", "--k", 3)
+    result = run("solve", *formula, "--y0", "1,0", "--t-end", 5, "--methods", "srkn11b", "--tol", 1e-9)
+    assert result.exit_code == 0
+    assert float(re.search(r"largest energy error ([0-9.e-]+)", result.output)[1]) <= 1e-9
+    stiff = run("solve", "p**2/2 + 1e6*q**2/2 + .5e-3*q", "--y0", "1,0", "--t-end", "0.01")
+    assert stiff.exit_code == 0
+    missing = run("solve", "p**2/2 + k*q**4/4", "--y0", "1,0")
+    assert missing.exit_code == 2
+    assert "`--k` is missing" in missing.output
+
+
+@pytest.mark.parametrize("locale", [{"PYTHONIOENCODING": "ascii"}, {"LC_ALL": "C", "PYTHONUTF8": "0"}], ids=str)
+def test_the_command_line_writes_utf_8(locale, tmp_path):
+    env = os.environ | {"PYTHONCOERCECLOCALE": "0", "PYTHONPATH": os.pathsep.join(filter(None, sys.path))} | locale
+    words = ["compare", "pendulum", "--methods", "verlet", "--t-end", "1", "--out", str(tmp_path)]
+    for call in (words, ["methods"]):
+        ended = subprocess.run([sys.executable, "-m", "sympflow.cli", *call], capture_output=True, check=False, env=env)
+        assert ended.returncode == 0, ended.stderr
+        text = ended.stdout.decode("utf-8")
+        assert not text.isascii() or call[0] == "methods"
+    assert (tmp_path / "pendulum.csv").read_text(encoding="utf-8").startswith("system,")

@@ -201,3 +201,18 @@ def test_a_wrong_file_is_named_with_what_is_wrong(name, text, message, files):
     assert result.exit_code == 2
     assert message in result.stderr
     assert "Traceback" not in result.output
+
+
+@pytest.mark.slow
+def test_a_flow_is_trained_on_it_certified_and_used(files):
+    small = ("--stages", 1, "--processor", 0, "--dt", 0.4, "--restarts", 1, "--steps", 2, "--points", 20)
+    trained = run("train", "quartic.toml", *small, "--out", "q.safetensors")
+    assert trained.exit_code == 0, trained.output
+    sample = ("--states", 20, "--times", 3, "--held-out", 3, "--t-end", 4)
+    for to in ("c.json", "certified.safetensors"):
+        found = run("certificate", "quartic.toml", "--flow", "q.safetensors", *sample, "--out", to)
+        assert found.exit_code == 0, found.output
+        assert "Certificate of a flow of quartic" in found.stdout
+    assert '"held_out": 3' in (files / "c.json").read_text(encoding="utf-8")
+    result = run("solve", "quartic.toml", "--method", "certified.safetensors", "--backend", "array")
+    assert result.exit_code == 0, result.output

@@ -156,3 +156,28 @@ def test_not_a_number_goes_through_signs_and_extremes():
         for name in ("min", "max"):
             assert np.isnan(float(apply(name, x, 0.0)[0]))
             assert np.isnan(float(apply(name, 0.0, x)[0]))
+
+
+def test_the_derivative_of_a_power_by_its_exponent_and_of_a_constant_power():
+    (slope,) = traced(lambda x: derivatives([x**2.5], [x])[0], "x")(1.3)
+    assert slope == pytest.approx(2.5 * 1.3**1.5, rel=1e-15)
+    by_exponent = traced(lambda n: derivatives([2.0**n], [n])[0], "n")(1.5)[0]
+    assert by_exponent == pytest.approx(2**1.5 * np.log(2), rel=1e-15)
+
+
+def test_conditions_and_choices():
+    def choose(x, y):
+        inside = apply("and", x < y, apply("not", apply("eq", x, 0.0)))
+        return apply("where", apply("or", inside, y <= -2.0), x * y, x - y)
+
+    x, y = np.array([1.0, 0.0, 3.0, -3.0]), np.array([2.0, 1.0, 1.0, -4.0])
+    expected = [2.0, -1.0, 2.0, 12.0]
+    tensors = torch.tensor(x), torch.tensor(y)
+    program = traced(lambda x, y: [choose(x, y), *derivatives([choose(x, y)], [x, y])[0]], "x", "y")
+    for values in ((x, y), tensors):
+        np.testing.assert_array_equal(choose(*values), expected)
+        value, by_x, by_y = program(*values)
+        np.testing.assert_array_equal(value, expected)
+        np.testing.assert_array_equal(by_x, [2.0, 1.0, 1.0, -4.0])
+        np.testing.assert_array_equal(by_y, [1.0, -1.0, -1.0, -3.0])
+    np.testing.assert_array_equal(run(choose, x, y, width=4), expected)

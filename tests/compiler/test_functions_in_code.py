@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sympflow.compiler.control import INT, POINTER, Module, Type
-from sympflow.compiler.elementary import FAR
+from sympflow.compiler.elementary import FAR, INLINE
 from sympflow.compiler.functions import FUNCTIONS, MOST_DERIVATIVES, apply
 from sympflow.compiler.machine import compiled
 
@@ -218,3 +218,29 @@ def test_derivatives_of_the_logarithm_of_gamma(m):
     y = run(of(f"polygamma{m}" if m else "digamma"), x, width=8)
     # sixteen terms of the recurrence, rounded to a unit each; where they cancel, a unit of the largest, or of πx
     assert (np.abs(y - exact) <= 16 * np.finfo(float).eps * (1 + np.abs(exact) + (m > 1) * np.abs(slope))).all()
+
+
+@pytest.mark.parametrize("name", [*CASES, "pow", "mod"])
+@pytest.mark.parametrize("width", [1, 8])
+def test_a_call_gives_the_bits_of_the_operations_in_place(name, width):
+    x = np.abs(CASES["tanh"][0])
+
+    def often(a):
+        more = [] if name in CASES else [1.7]
+        values = [apply(name, a * c, *[a.code.constant(m, a.type) for m in more]) for c in range(1, INLINE + 3)]
+        assert a.code.module.has(f"{'circle' if name in ('sin', 'cos') else name}.{a.type.suffix}")
+        return values[0] + values[-1]
+
+    def once(c):
+        return run(lambda a: apply(name, a * float(c), *([] if name in CASES else [a * 0.0 + 1.7])), x)
+
+    assert same(run(often, x, width=width), once(1) + once(INLINE + 2))
+
+
+def test_what_was_calculated_in_a_branch_is_not_used_after_it():
+    def function(a):
+        (y,) = a.code.when(a > 100.0, lambda: [apply("sin", a)], lambda: [a])
+        return y + apply("cos", a)
+
+    x = around(0, 200)
+    np.testing.assert_allclose(run(function, x), np.where(x > 100, np.sin(x), x) + np.cos(x), rtol=1e-13, atol=1e-15)

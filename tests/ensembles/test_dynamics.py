@@ -48,3 +48,17 @@ def test_an_orbit_that_fails_is_a_row():
         result = sympflow.ensemble(SYSTEM, "verlet", (0, 60), y0, dt=0.1, reduce=reduce)
         assert result.status.tolist() == [0, -1]
         assert "finite" in result.messages[1,]
+
+
+def test_orbits_that_fail_have_no_crossings_whatever_the_chunks():
+    system = sympflow.systems.henon_heiles_escape()
+    y0 = np.concatenate([[[9.0, 0.1, 0.0, 0.0]], 0.1 * np.random.default_rng(1).standard_normal((5, 4)), [system.y0]])
+    how = {"t_span": (0, 20), "dt": 0.05, "reduce": "crossings"}
+    whole = sympflow.ensemble(system, "verlet", y0=y0, **how)
+    np.testing.assert_array_equal(np.isnan(whole.n_crossings), whole.status < 0)
+    assert (whole.status < 0).sum() == 2
+    assert np.isnan(whole.crossing_times[whole.status < 0]).all()
+    assert np.isnan(whole.crossing_states[whole.status < 0]).all()
+    parts = sympflow.ensemble(system, "verlet", y0=y0, chunk=2, **how)
+    np.testing.assert_array_equal(whole.n_crossings, parts.n_crossings)
+    np.testing.assert_array_equal(whole.crossing_times, parts.crossing_times)

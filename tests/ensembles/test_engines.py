@@ -4,6 +4,7 @@ import importlib.util
 import multiprocessing
 import os
 import signal
+import threading
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
@@ -63,3 +64,19 @@ def example():
 def test_the_example_runs(tmp_path):
     result = example().run(1, 64, str(tmp_path / "a.zarr"))
     assert result.energy_error.max() < 1e-3
+
+
+@pytest.mark.slow
+def test_compiling_in_several_threads_at_once():
+    """Threads of a program that calls ensembles at the same time."""
+    system = sympflow.HamiltonianSystem.from_sympy("p**2/2 + q**2/2 + q**4/17", y0=[1.0, 0.0], dt=0.1)
+    found = []
+    threads = [
+        threading.Thread(target=lambda: found.append(sympflow.ensemble(system, "verlet", (0, 1)).y)) for _ in range(3)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(found) == 3
+    assert all(np.array_equal(y, found[0]) for y in found)

@@ -2,6 +2,9 @@
 
 import errno
 import os
+import signal
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -118,3 +121,31 @@ def test_a_store_is_of_one_step_and_one_function(tmp_path):
     (name,) = again.fields
     assert np.array_equal(again.fields[name], expected.fields[name])
     assert (tmp_path / "a.zarr" / "dof" / "0").exists()
+
+
+KILLED = """
+import os, signal, sys
+import numpy as np
+import sympflow
+
+system = sympflow.systems.henon_heiles()
+states = np.load(sys.argv[1])
+
+def stop(done, total):
+    if done >= 130:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+sympflow.ensemble(system, "verlet", (0, 1), states, dt=0.1, t_eval=[0.0, 0.5, 1.0], chunk=64,
+                  store=sys.argv[2], progress=stop)
+"""
+
+
+@pytest.mark.slow
+def test_a_killed_program_goes_on(tmp_path):
+    np.save(tmp_path / "states.npy", STATES)
+    words = [sys.executable, "-c", KILLED, str(tmp_path / "states.npy"), str(tmp_path / "a.zarr")]
+    assert subprocess.run(words, check=False, capture_output=True).returncode == -signal.SIGKILL
+    told = []
+    result = run(store=tmp_path / "a.zarr", resume=True, progress=lambda done, total: told.append(done))
+    assert told[0] >= 128
+    assert np.array_equal(result.y, run().y, equal_nan=True)

@@ -226,3 +226,30 @@ def test_states_are_drawn_alike_in_any_chunks():
 
     for y0 in (SYSTEM.domain, lambda rng, n: 0.1 * rng.standard_normal((n, 4))):
         assert np.array_equal(drawn(y0, 5000), drawn(y0, 999))
+
+
+@pytest.mark.parametrize(("method", "options"), [("verlet", {"backend": "array"}), ("dop853", {})])
+def test_the_same_bits_where_python_runs(method, options):
+    def final(chunk):
+        return sympflow.ensemble(SYSTEM, method, (0, 1), STATES[:80], reduce="final", chunk=chunk, **options).final
+
+    reference = final(80)
+    for chunk in (1, 7, 64):
+        assert np.array_equal(final(chunk), reference)
+
+
+def test_energy_errors_where_some_values_drive_the_system():
+    H = "p**2/2 + q**2/2 - (a - b)*q*cos(t)"
+    system = sympflow.HamiltonianSystem.from_sympy(H, time="t", params={"a": 0.3, "b": 0.0})
+
+    def swept(**params):
+        how = {"params": params, "dt": 0.1, "reduce": "energy_error", "backend": "array"}
+        return sympflow.ensemble(system, "verlet", (0, 1), [[1.0, 0.0], [0.0, 1.0]], **how)
+
+    for values in ([0.0, 0.1], [0.1, 0.0]):
+        with pytest.raises(ValueError, match=r"`system` .* is driven, H depends on t, so its energy is not kept"):
+            swept(a=values)
+    result = swept(a=[0.3, 0.2], b=[0.3])
+    assert result.status.tolist() == [[[0, 0]], [[-1, -1]]]
+    assert "`params` has a = 0.2, b = 0.3: `system`" in result.messages[1, 0, 1]
+    assert np.isfinite(result.energy_error).all(axis=(1, 2)).tolist() == [True, False]

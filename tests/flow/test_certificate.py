@@ -168,3 +168,61 @@ def test_solve_says_that_the_certificate_does_not_hold_outside():
 def test_bad_arguments_are_refused(arguments, message):
     with pytest.raises(ValueError, match=message):
         primed().certificate(HH, **arguments)
+
+
+@pytest.mark.slow
+def test_the_bound_counts_steps():
+    found = primed().certificate(HH, **QUICK)
+    delta = found.delta.largest
+    assert [found.bound(t) / delta for t in (0.0, 0.1, 0.5, 0.6, 100.0, -1.0)] == pytest.approx([0, 1, 1, 2, 200, 2])
+
+
+@pytest.mark.slow
+def test_delta_is_the_integral_of_the_rate():
+    """Against H itself: the mean over x of d/dt H(ψ̄_t(x)), integrated, is what H gained."""
+    flow = primed()
+    found = flow.certificate(HH, **{**QUICK, "states": 1, "times": 401})
+    # one state alone: the integral of |rate| is at least what H gained, and the variation of H along the step
+    t = torch.linspace(0, flow.dt, 401, dtype=torch.float64)
+    x = HH.domain.sample(1, int(np.random.SeedSequence([0, 20_261, 0]).generate_state(1)[0]))
+    H = HH.hamiltonian(flow.psi(t, torch.tensor(x))).numpy()
+    assert found.delta.median == pytest.approx(np.abs(np.diff(H)).sum(), rel=2e-3)
+    assert found.delta.median == found.delta.q95 <= found.delta.largest  # which is searched for near the state
+
+
+@pytest.mark.slow
+def test_delta_is_not_exceeded_by_states_that_are_drawn_later():
+    """A state at which a step of the Kepler flow gains twice the largest of 2000 samples; and 20,000 others."""
+    kepler = systems.kepler()
+    flow = sympflow.load(next(f.path for f in sympflow.shipped_flows(kepler) if f.name == "kepler-primed-2-0.15"))
+    found = flow.certificate(kepler, held_out=2, t_end=1.0)
+    worst = np.array([[-0.36674323, -0.05063473, -0.0382541, -2.10487249]])
+    x = np.concatenate([worst, kepler.domain.sample(20_000, 4711)])
+    H = kepler.hamiltonian
+    gain = np.abs(H(flow.bind(kepler).psi(flow.dt, torch.as_tensor(x)).detach().numpy()) - H(x))
+    assert gain.max() <= found.delta.largest < 3 * gain.max()
+
+
+EPS = np.finfo(float).eps
+
+
+def test_an_exact_flow_is_found_exact(rotation):
+    found = rotation.certificate(OSCILLATOR, **QUICK)
+    for q in (found.defect, found.hamiltonian_error, found.delta):
+        assert q.largest < 8 * EPS
+    assert found.energy_error.largest < 100 * 8 * EPS
+    assert found.bound(100.0) < 100 * 8 * EPS
+
+
+def test_the_measured_errors_are_those_of_solve(certified):
+    flow = certified[0]
+    found = flow.certified
+    x = HH.domain.sample(20, int(np.random.SeedSequence([0, 20_261, 1]).generate_state(1)[0]))
+    together = solve(HH, flow, (0.0, 100.0), y0=x, on_domain_exit="ignore")  # rounds as the measured batch does
+    errors = np.abs(together.energy() - together.energy()[:, :1])
+    runs = [solve(HH, flow, (0.0, 100.0), y0=y, on_domain_exit="stop") for y in x]
+    assert found.left == sum(run.status != 0 for run in runs)
+    errors = np.array([row[: len(run.t)].max() for row, run in zip(errors, runs, strict=True)])
+    assert found.energy_error.largest == pytest.approx(errors.max(), rel=1e-9)
+    relative = errors / np.abs(together.energy()[:, 0])
+    assert found.relative_energy_error.largest == pytest.approx(relative.max(), rel=1e-9)

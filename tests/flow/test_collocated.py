@@ -40,3 +40,10 @@ def test_with_friction_it_is_conformally_symplectic_and_the_flow_of_no_hamiltoni
     assert np.max(conformal_defect(sol)) < 1e-13
     with pytest.raises(ValueError, match="so `flow` has no Hamiltonian"):
         flow.hamiltonian(0.1, torch.as_tensor(DAMPED.y0))
+
+
+@pytest.mark.slow
+def test_gradients_of_runs_are_those_of_differences():
+    flow = SympFlow.collocated(WHOLE, dt=0.5, stages=2)
+    x = torch.tensor([0.4, 0.3], dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda x: flow(1.2, x), x)

@@ -13,6 +13,7 @@ from test_primed import FLOWS as PRIMED
 from sympflow import Box, HamiltonianSystem, MLPFlow, SympFlow, Tube, load, solve, systems, time_transformed
 from sympflow.flow.clocked import ClockedFlow
 from sympflow.flow.families import FAMILIES
+from sympflow.flow.flow_map import FlowMap
 from sympflow.flow.layers import Drift, Kick
 from sympflow.flow.planetary import KeplerFlow
 from sympflow.flow.potentials import MLPPotential
@@ -283,3 +284,30 @@ def test_runs_files_and_copies_are_the_flow(lawful, tmp_path):
         )
         direct = torch.stack([flow(float(s - t0), x, **begun) for s in run.t], -1)
         np.testing.assert_allclose(run.y, direct, rtol=0, atol=1e3 * EPS * float(1 + direct.abs().max()))
+
+
+def test_a_family_of_ones_own_needs_only_the_map():
+    class Identity(FlowMap):
+        kind = "sympflow"
+
+        def _map(self, t, y):
+            return y
+
+        _map_inverse = _map
+
+    flow = Identity(1, 0.5)
+    x = torch.ones(3, 2, dtype=torch.float64)
+    assert torch.equal(flow(-1.2, x), x)
+    assert solve(PENDULUM, flow, (0, 2), y0=[0.1, 0.2]).y[:, -1] == pytest.approx([0.1, 0.2], abs=0)
+
+
+@pytest.mark.parametrize("backend", ["compiled", "array"])
+def test_one_planet_is_back_after_its_period(backend):
+    """Whatever the trained numbers are: its motion is Kepler's, and nothing kicks it."""
+    masses = [1.0, 0.01]
+    system = HamiltonianSystem.planets(masses, elements={"a": [1.3], "e": [0.3], "inc": [0.2]}, encounter=None)
+    period = 2 * np.pi * np.sqrt(1.3**3 / sum(masses))
+    flow = KeplerFlow(system.ndof, 2, 1, period / 16, system=system)
+    flow.kicks.copy_(torch.linspace(0.1, 0.4, 4))
+    sol = solve(system, flow, (0, period), t_eval=[0.3, period], backend=backend)
+    np.testing.assert_allclose(sol.y[:, -1], system.y0, rtol=0, atol=16 * 64 * EPS)

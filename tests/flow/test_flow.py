@@ -178,3 +178,66 @@ def test_every_state_at_every_time_where_it_is_asked_for():
 def test_a_flow_that_no_baseline_matches():
     with pytest.raises(ValueError, match=r"`flow` has only 16 parameters.*use a larger flow"):
         MLPFlow.matching(SympFlow(1, pairs=1, hidden=(2,)))
+
+
+@pytest.mark.parametrize("activation", ACTIVATIONS)
+def test_activations_against_autograd(activation):
+    sigma = ACTIVATIONS[activation]
+    a = torch.linspace(-4, 4, 41, dtype=torch.float64, requires_grad=True)
+    da = torch.cos(3 * a.detach())
+    value, slope, dvalue, dslope = sigma.tangent(a, da)
+    torch.testing.assert_close(sigma.value(a), value)
+    torch.testing.assert_close(sigma.slope(a), (value, slope))
+    torch.testing.assert_close(slope, torch.autograd.grad(value.sum(), a, retain_graph=True)[0])
+    torch.testing.assert_close(dvalue, slope * da)
+    torch.testing.assert_close(dslope, torch.autograd.grad(slope.sum(), a)[0] * da)
+
+
+def test_gradients_of_the_closed_forms():
+    """Autograd through the map, its velocity and its Hamiltonian, to the states, times and weights."""
+    flow = rough(SympFlow(1, pairs=1, hidden=(3, 3)))
+    x, t = states(2, 1).requires_grad_(), times(2).requires_grad_()
+    assert torch.autograd.gradcheck(flow.psi_and_velocity, (t, x))
+    assert torch.autograd.gradcheck(flow.hamiltonian, (t, x))
+    names, weights = zip(*flow.named_parameters(), strict=True)
+
+    class Velocity(SympFlow):
+        def forward(self, t, x):
+            return self.psi_and_velocity(t, x)
+
+    module = Velocity.from_layers(flow.layers, flow.dt)
+
+    def of_weights(*weights):
+        return torch.func.functional_call(module, dict(zip(names, weights, strict=True)), (t.detach(), x.detach()))
+
+    assert torch.autograd.gradcheck(of_weights, weights)
+
+
+def test_gradients_flow_through_the_extension():
+    flow = rough(SympFlow(1, hidden=(4,)))
+    x, t = states(3, 1).requires_grad_(), torch.tensor([0.4, 2.3, -1.7], dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(flow, (t, x))
+    assert torch.autograd.gradcheck(flow.inverse, (t, x))
+
+
+def test_float32_follows_float64():
+    double, single = SympFlow(2, seed=3), SympFlow(2, seed=3, dtype=torch.float32)
+    x = states(10, 2)
+    y = single(2.3, x.float())
+    assert y.dtype == torch.float32
+    torch.testing.assert_close(y.double(), double(2.3, x), rtol=0, atol=1e-5)
+    assert torch.equal(
+        single(torch.tensor([0.3, 0.7], dtype=torch.float32), x[:2].float())[0], single(0.3, x[0].float())
+    )
+    assert double.to(torch.float32).dtype == torch.float32
+
+
+def test_scaling_changes_the_units_only():
+    """A flow of scaled states is the scaled flow: ψ^s_{τt}(s x) = s ψ_t(x)."""
+    plain = rough(SympFlow(1, seed=7))
+    scaled = rough(SympFlow(1, seed=7, dt=0.01, scale=Scaling((0.5,), (50.0,), 0.01)))
+    s, x = torch.tensor([0.5, 50.0], dtype=torch.float64), states(10, 1)
+    torch.testing.assert_close(scaled(0.027, s * x), s * plain(2.7, x), rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(
+        scaled.hamiltonian(0.004, s * x), 25.0 / 0.01 * plain.hamiltonian(0.4, x), rtol=1e-12, atol=1e-12
+    )

@@ -141,3 +141,22 @@ def test_a_drive_given_by_samples_is_fitted(plain):
     assert flow.figures["one_step_error"] < 1e-4
     with pytest.raises(ValueError, match=r"^`system` .* no step of dt = 20 begins and ends: give it the period"):
         sympflow.train(system, flow=SympFlow.primed(system, 2, dt=20.0), **options)
+
+
+def test_its_hamiltonian_is_near_that_of_the_system(system, flow):
+    """Up to a function of t, at all times of a step."""
+    y = states(system)
+    for t in (0.1, 0.25, DT):
+        H = flow.hamiltonian(t, torch.tensor(y), T0).detach().numpy() - system.hamiltonian(y, T0 + t)
+        assert np.ptp(H) < 1e-2 * np.ptp(system.hamiltonian(y, T0 + t))
+
+
+def test_many_outputs_are_those_of_single_ones(system, flow):
+    """χ of 300 outputs, more than are made at once and no multiple of those in a vector, each at its own time."""
+    x, span = states(system, 3), (T0, T0 + 299 * DT)
+    one, rows, arrays = (
+        solve(system, flow, span, y0, **more).y for y0, more in ((x[0], {}), (x, {}), (x, {"backend": "array"}))
+    )
+    assert one.shape == (2, 300)
+    np.testing.assert_allclose(rows[0], one, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(rows, arrays, rtol=0, atol=1e-12)

@@ -5,7 +5,7 @@ import struct
 
 import pytest
 import torch
-from conftest import tampered
+from conftest import record, tampered
 
 from sympflow.flow.files import load
 from sympflow.flow.layers import Drift, Kick
@@ -189,3 +189,28 @@ def test_one_flipped_bit_of_the_weights_is_refused(file, place):
     file.write_bytes(content)
     with pytest.raises(ValueError, match=r"`path` .* not those that were saved: their checksum differs"):
         load(file)
+
+
+@pytest.mark.parametrize("make", MAKERS.values(), ids=MAKERS.keys())
+def test_round_trip(make, tmp_path):
+    flow, path = make(), tmp_path / "flow.safetensors"
+    flow.domain = Box([-1.0] * 4, [1.0] * 4)
+    flow.recipe, flow.figures = {"stages": [{"steps": 3}]}, {"one_step_error": 1e-3, "energy_error": math.inf}
+    flow.save(path)
+    same = load(path)
+    x = torch.randn(5, 4, dtype=flow.dtype)
+    assert torch.equal(same(1.3, x), flow(1.3, x))
+    assert same.dtype == flow.dtype
+    assert (same.domain, same.recipe) == (flow.domain, flow.recipe)
+    assert same.figures == {"one_step_error": 1e-3, "energy_error": None}
+    assert not any(w.requires_grad for w in same.parameters())
+    assert record(path)["version"]
+
+
+def test_tensors_that_changed_places_are_refused(file):
+    def swap(tensors):
+        a, b = (f"layers.{i}.potential.weight_out" for i in (0, 1))
+        tensors[a], tensors[b] = tensors[b], tensors[a]
+
+    with pytest.raises(ValueError, match="checksum differs"):
+        load(tampered(file, change_tensors=swap, rechecked=False))

@@ -7,7 +7,7 @@ from conftest import FULL_MASS_MATRIX, tampered
 from conftest import RELATIVISTIC as RELATIVISTIC_H
 
 import sympflow
-from sympflow import HamiltonianSystem, SympFlow, get, systems, train
+from sympflow import HamiltonianSystem, SympFlow, get, solve, systems, train
 from sympflow.kernels.splitting_loops import splitting_loops
 from sympflow.schemes import SCHEMES, Scheme
 
@@ -210,3 +210,83 @@ def test_asymmetric_schemes_make_no_palindrome():
 
 
 # energy over long times -------------------------------------------------------------------------------------------
+
+
+def test_stages_are_equal_leapfrog_steps():
+    flow, y = SympFlow.primed(HH, 5), HH.domain.sample(4, 0)
+    expected = solve(HH, "leapfrog", (0.0, 1.0), y0=y, dt=0.2).y[..., -1]
+    np.testing.assert_allclose(flow(1.0, torch.tensor(y)).detach().numpy(), expected, atol=32 * EPS)
+    assert flow.scheme().force_evaluations == 5
+
+
+def test_steps_that_begin_with_a_kick_are_verlets():
+    """Half of the first and the last kick belong to each step, and a palindrome of four kicks has three numbers."""
+    system = systems.quartic()
+    flow = SympFlow.primed(system, 4, dt=0.4, first="kick", curvature=True)
+    y0 = system.domain.sample(5, seed=0)
+    expected = solve(system, "verlet", (0, 0.4), y0, dt=0.1).y[..., -1]
+    np.testing.assert_allclose(flow(0.4, torch.tensor(y0)).detach().numpy(), expected, atol=8 * EPS)
+    assert flow.kernel_scheme().force_evaluations == 4
+    assert flow.curvatures.free.numel() == 3 * len(flow.curvatures.exponents)
+
+
+def test_outputs_of_a_processed_flow_change_nothing():
+    flow, span = processed(), (0.0, 40.0)
+    few, many = (solve(HH, flow, span, t_eval=t).y[:, -1] for t in ([40.0], np.linspace(*span, 81)))
+    np.testing.assert_array_equal(few, many)
+    for steps in (80, 301):  # χ of several outputs at once, and of those that are left
+        end = solve(HH, flow, (0.0, float(steps)), save_every=1).y
+        np.testing.assert_array_equal(end[:, -1], solve(HH, flow, (0.0, float(steps)), t_eval=[steps]).y[:, -1])
+    every = solve(HH, flow, span)
+    np.testing.assert_array_equal(every.y[:, 0], HH.y0)
+    np.testing.assert_allclose(every.y[:, -1], few, atol=1e-13)
+
+
+def test_gradients_flow_through_a_processed_run():
+    flow = processed(size=0.02)
+    y0 = torch.tensor(HH.y0, requires_grad=True)
+    solve(HH, flow, (0.0, 3.5), y0=y0, t_eval=[3.5]).y.sum().backward()
+    expected = torch.func.grad(lambda y: flow(3.5, y).sum())(torch.tensor(HH.y0))
+    torch.testing.assert_close(y0.grad, expected, rtol=0, atol=1e-11)
+
+
+def test_evaluations_are_counted():
+    stats = solve(HH, random_flow(HH, scheme="verlet"), (0.0, 10.0), backend="array").stats
+    assert (stats["force_evaluations"], stats["hessian_evaluations"]) == (20, 20)
+    stats = solve(HH, random_flow(HH, stages=3), (0.0, 10.0)).stats
+    assert (stats["force_evaluations"], stats["hessian_evaluations"]) == (30, 30)
+    assert "curvature_evaluations" not in stats
+    for backend in ("compiled", "array"):
+        stats = solve(HH, random_flow(HH, stages=3, curvature=True), (0.0, 10.0), backend=backend).stats
+        assert stats["curvature_evaluations"] == 30
+
+
+@pytest.mark.parametrize(("system", "stages", "processor"), [(PENDULUM, 2, 2), (HH, 3, 0), (HH, 2, 3)])
+def test_no_drift_over_a_million_steps(system, stages, processor):
+    """The slope of the energy error is within three standard errors of 0, or below what rounding adds at random."""
+    start = SympFlow.primed(system, stages, dt=0.5, processor=processor, degree=3)
+    options = {"restarts": 1, "steps": 10, "points": 40, "reference_states": 20, "progress": False}
+    flow = train(system, flow=start, **options)
+    n = 1_000_000
+    sol = solve(system, flow, (0.0, n * flow.dt), t_eval=np.linspace(0, n * flow.dt, 4001), y0=0.5 * system.y0)
+    drift, T = sympflow.energy_drift(sol), n * flow.dt
+    error = np.abs(sol.energy_error())
+    assert abs(drift.slope) * T <= max(3 * drift.standard_error * T, 10 * EPS * n**0.5)
+    assert error.max() < 2 * error[:400].max()
+    assert sol.stats["force_evaluations"] == n * stages + (4000 + 1) * processor
+
+
+@pytest.mark.parametrize("rows", [(), (3,)])
+@pytest.mark.slow
+def test_compensated_sums_with_curvature(rows):
+    """The same run but for rounding, and less of that: n steps and their inverses lead nearer to where it began."""
+    flow, y0 = "pendulum-primed-3-0.6", np.broadcast_to([1.1, 0.3], (*rows, 2))
+    misses = []
+    for compensated in (False, True):
+        method = get("sympflow")(flow=flow, compensated=compensated)
+        there = solve(PENDULUM, method, (0.0, 6000.0), y0, save_every=10000)
+        assert (there.stats["backend"], there.stats["curvature_evaluations"] > 30_000) == ("compiled", True)
+        back = solve(PENDULUM, method, (6000.0, 0.0), there.y[..., -1], save_every=10000)
+        misses.append(np.abs(back.y[..., -1] - y0).max())
+    assert 0 < misses[1] < misses[0] < 1e-10
+    assert misses[1] < 1e-11

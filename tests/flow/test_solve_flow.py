@@ -108,3 +108,18 @@ def test_a_network_that_ships_runs_by_its_numbers_as_by_its_module():
     np.testing.assert_allclose(tensors.y.numpy(), sol.y, atol=1e3 * EPS)
     with pytest.raises(ValueError, match="`compensated` sums need the compiled loops of a primed flow"):
         solve(oscillator, "sympflow", (0.0, 1.0), compensated=True)
+
+
+def test_a_smaller_step_composes_another_map():
+    sol = solve(HH, FLOW, (0.0, 1.0), dt=0.25, on_domain_exit="ignore")
+    y = torch.tensor(HH.y0)
+    for _ in range(4):
+        y = FLOW(0.25, y)
+    np.testing.assert_allclose(sol.y[:, -1], y.numpy(), atol=32 * EPS)
+
+
+def test_float32():
+    flow = random_flow(dtype=torch.float32)
+    sol = solve(HH, flow, (0.0, 2.0), dtype="float32", on_domain_exit="ignore")
+    assert sol.y.dtype == np.float32
+    assert solve(HH, flow, (0, 1), y0=torch.tensor(HH.y0, dtype=torch.float32)).y.dtype == torch.float32

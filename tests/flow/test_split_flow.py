@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from sympflow import Box, HamiltonianSystem, SympFlow, get, solve
-from sympflow.systems import double_well, fput
+from sympflow.systems import double_well, fput, harmonic_oscillator
 from sympflow.systems.chains import oscillatory_energies
 from sympflow.training.trainer import train
 
@@ -80,3 +80,11 @@ def test_the_shipped_flow_of_fput_reaches_its_figures():
     assert np.abs(oscillatory_energies(system, sol.y.T).sum(-1) - 1).max() < 0.08
     between = solve(system, t_eval=np.linspace(0, 200, 301)[1:] - 0.05)
     assert np.abs(between.energy_error()).max() < 1e-4
+
+
+@pytest.mark.parametrize("turn", [20.0, 1e3])
+def test_the_oscillator_for_a_million_steps(turn):
+    system = harmonic_oscillator(100.0)
+    flow = SympFlow.split(system, 1, dt=turn / 100)
+    sol = solve(system, flow, (0, 1e6 * flow.dt), save_every=1000, on_domain_exit="ignore")
+    assert np.abs(sol.energy_error()).max() < 1e-11

@@ -4,6 +4,7 @@ import mpmath
 import numpy as np
 import pytest
 import sympy as sp
+import torch
 from scipy.integrate import solve_ivp
 from scipy.special import expit
 
@@ -89,3 +90,32 @@ def test_a_force_that_is_no_number_is_told():
     assert sol.status == -1
     assert "the force is NaN" in sol.message
     assert "Reduce `dt`" not in sol.message
+
+
+@pytest.mark.parametrize(
+    ("V", "slope"),
+    [
+        (lambda q: -1 / (1 + np.exp(300 * q[..., 0])), lambda q: 300 * expit(300 * q) * expit(-300 * q)),
+        (lambda q: -1 / (1 + torch.exp(300 * q[..., 0])), lambda q: 300 * expit(300 * q) * expit(-300 * q)),
+        (lambda q: np.log1p(np.exp(-300 * q[..., 0])) / 3, lambda q: -100 * expit(-300 * q)),
+        (lambda q: -1 / np.cosh(200 * q[..., 0]) ** 2, lambda q: 400 * np.tanh(200 * q) / np.cosh(200 * q) ** 2),
+    ],
+)
+def test_functions_of_python_are_written_so_too(V, slope):
+    with np.errstate(all="ignore"):
+        system = HamiltonianSystem(potential=V, ndof=1, y0=[5.0, 1.0])
+        q = np.array([5.0, 0.003, -0.004, -2.0])
+        y = np.stack([q, 0 * q], axis=-1)
+        assert system.gradient(y)[:, 0] == pytest.approx(np.nan_to_num(slope(q)), rel=1e-12, abs=1e-300)
+    sol = sf.solve(system, "verlet", (0, 0.01), y, dt=0.01)
+    assert sol.stats["backend"] == "compiled"
+    with np.errstate(all="ignore"):
+        assert sol.y[:, 0, -1] == pytest.approx(q - 5e-5 * np.nan_to_num(slope(q)), rel=1e-13)
+
+
+@pytest.mark.parametrize("backend", ["auto", "array"])
+def test_gradients_flow_through_them(backend):
+    y0 = torch.tensor([[5.0, -1.0], [-5.0, 1.0]], dtype=torch.float64, requires_grad=True)
+    system = HamiltonianSystem.from_sympy("p**2/2 - 1/(1 + exp(300*q)) + log(1 + exp(300*q))/3e3")
+    sf.solve(system, "verlet", (0, 2), y0, dt=0.01, backend=backend).y[:, 0, -1].sum().backward()
+    assert y0.grad.numpy() == pytest.approx(np.array([[1.0, 2.0], [1.0, 2.0]]), abs=1e-12)

@@ -161,3 +161,16 @@ def test_compiled_code_agrees_on_what_lies_in_a_sublevel(system, slack):
         assert all_within(system, domain, x, slack) == expected.all()
     other = domain.attach(system.symbols.hamiltonian)
     assert not all_within(system, other, inside, slack)  # an H of its own, which is not compiled
+
+
+def test_a_shell_is_what_its_bounds_say():
+    shell = systems.kepler().domain
+    q, p = np.split(shell.sample(500, 3), 2, axis=1)
+    E = (p**2).sum(1) / 2 - 1 / np.linalg.norm(q, axis=1)
+    L = abs(q[:, 0] * p[:, 1] - q[:, 1] * p[:, 0])
+    a, e = -1 / (2 * E), np.sqrt(1 + 2 * E * L**2)
+    assert 0.95 < a.min() < a.max() < 1.05
+    assert 0.45 < e.min() < e.max() < 0.67
+    angle = np.arctan2(q[:, 1], q[:, 0])
+    assert abs(np.exp(1j * angle).mean()) < 5 / math.sqrt(2 * 500)
+    assert not shell.contains([1.0, 0.0, 0.0, 1.0])  # a circle: too much angular momentum

@@ -1,7 +1,11 @@
 """Galley's doubling: any force as a Hamiltonian system in twice the variables."""
 
+import pickle
+
 import numpy as np
 import pytest
+import sympy as sp
+from scipy.integrate import solve_ivp
 
 import sympflow
 from sympflow import HamiltonianSystem, doubled, solve, systems
@@ -43,6 +47,24 @@ class TestHamiltonian:
         field, (q, p) = pendulum.physical.vector_field(y), y.T
         np.testing.assert_array_equal(pendulum.physical_limit(pendulum.vector_field(x)), field)
         np.testing.assert_allclose(field, np.stack([p, -np.sin(q) - 0.3 * p * abs(p)], axis=-1), atol=1e-15)
+
+    def test_it_agrees_with_the_copies_to_second_order_in_their_difference(self):
+        base = systems.henon_heiles()
+        system = doubled(base, ["-p1/5", "-p2**3"])
+        y = base.domain.sample(5, 2)
+        z = np.random.default_rng(3).normal(size=y.shape)
+        gaps = []
+        for size in (1e-2, 1e-3):
+            x = np.concatenate([y[:, :2], size * z[:, :2], size * z[:, 2:], y[:, 2:]], axis=1)
+            copies = base.hamiltonian(y + size * z / 2) - base.hamiltonian(y - size * z / 2)
+            K = size * (z[:, 0] * -y[:, 2] / 5 + z[:, 1] * -(y[:, 3] ** 3))
+            gaps.append(abs(system.hamiltonian(x) - (copies - K)).max())
+        assert gaps[1] < 2e-3 * gaps[0]
+
+    def test_damping_is_taken_over(self, oscillator):
+        damped = doubled(systems.damped_oscillator(damping=RATE))
+        assert sp.expand(damped.symbols.H - oscillator.symbols.H) == 0
+        assert damped.physical.external_force is None
 
 
 class TestPhysicalSolution:
@@ -102,6 +124,24 @@ class TestPhysicalSolution:
         sol = solve(oscillator, "projected", (0, 20), of="tao4", dt=0.1).physical()
         assert sol.stats["difference"] == 0
         np.testing.assert_allclose(sol.y, exact(sol.t), atol=1e-6)
+
+    def test_the_doubled_flow_is_symplectic(self, pendulum):
+        sol = solve(pendulum, "gauss_legendre6", (0, 5), dt=0.1)
+        assert sympflow.symplecticity_defect(sol) < 1e-12
+
+    def test_outputs_are_those_of_the_physical_states(self, pendulum):
+        event = lambda t, y: y[0]  # noqa: E731
+        sol = solve(pendulum, "gauss_legendre6", (0, 10), [0.5, 0.2], dt=0.1, dense_output=True, events=event)
+        physical = sol.physical()
+        assert physical.system is pendulum.physical
+        assert physical.y.shape == (2, 101)
+        assert physical.sol(1.23).shape == (2,)
+        assert physical.sol([0.1, 0.2, 0.3]).shape == (2, 3)
+        assert physical.y_events[0].shape[1] == 2
+        true = solve_ivp(pendulum.physical, (0, 10), [0.5, 0.2], rtol=1e-11, atol=1e-11, dense_output=True)
+        np.testing.assert_allclose(physical.sol(sol.t), true.sol(sol.t), atol=1e-7)
+        assert sympflow.reference_error(physical).max() < 1e-7
+        assert pickle.loads(pickle.dumps(physical)).system.external_force is not None
 
 
 @pytest.mark.parametrize(

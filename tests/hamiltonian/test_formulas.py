@@ -1,5 +1,7 @@
 """Formulas of all kinds: right values, or an error at once; compiled code has the values of arrays."""
 
+import random
+
 import mpmath
 import numpy as np
 import pytest
@@ -10,6 +12,9 @@ from numba import njit
 from scipy.interpolate import CubicSpline
 
 from sympflow import HamiltonianSystem, doubled, solve
+from sympflow.integrators.implicit import gauss_legendre
+from sympflow.kernels.newton import newton_code
+from sympflow.kernels.one_steps import lettered
 
 made = HamiltonianSystem.from_sympy
 Y = np.array([0.31, 0.47, 0.23, -0.39])
@@ -161,3 +166,46 @@ def test_a_power_of_a_maximum_between_one_and_two(method, backend):
 )
 def test_what_is_infinite_within_a_function_is_no_raw_error(V):
     assert solve(made(f"p**2/2 + {V}"), "verlet", (0, 0.03), [2.6, 0.1], dt=0.01).success
+
+
+def formula(r: random.Random, depth: int) -> str:
+    """A random expression in q1, p1, q2, p2 and a."""
+    if depth == 0 or r.random() < 0.15:
+        return r.choice(["q1", "p1", "q2", "p2", "a", "2", "0.7", "1/3"])
+    a, b, c, e = (formula(r, depth - 1) for _ in range(4))
+    whole = f"({a} + {b})", f"({a})*({b})", f"({a})/({b})", f"({a})**2.5", f"({a})**17", f"({a})**({b})"
+    chosen = f"Max({a}, {b})", f"Min({a}, {b})", f"Piecewise(({a}, ({b})**2 <= {c}), ({e}, True))"
+    return r.choice([*whole, *chosen, *(f"{r.choice(FUNCTIONS)}({a})" for _ in range(7))])
+
+
+def slopes(system):
+    """∇H and the upper triangle of ∇²H as they are compiled."""
+    return newton_code(lettered(system.symbols, [system.symbols.H]), gauss_legendre(1), False, False).slopes
+
+
+@pytest.mark.parametrize("seed", range(25))
+def test_derivatives_of_random_formulas_are_those_of_H_and_of_compiled_code(seed):
+    text = formula(random.Random(seed), 2)
+    try:
+        system = made(f"p1**2/2 + p2**2/2 + a*q1 + {text}", params={"a": 0.6})
+    except ValueError:  # of one that is nowhere real
+        pytest.skip("refused")
+    with np.errstate(all="ignore"):
+        g, h = system.gradient(Y), system.hessian(Y)
+        if not (np.isfinite(g).all() and np.isfinite(h).all() and np.abs(h).max() < 1e6):
+            pytest.skip("not defined there")
+        differences = [(system.hamiltonian(Y + d) - system.hamiltonian(Y - d)) / 2e-5 for d in 1e-5 * np.eye(4)]
+    np.testing.assert_allclose(g, differences, rtol=1e-4, atol=1e-5)
+    found = slopes(system)(*Y.tolist())
+    np.testing.assert_allclose(found[:4], g, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(found[4:], h[np.triu_indices(4)], rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("q", [0.0, 1e-9, 1e-4, 0.999, 1.001, 30.0])
+def test_the_compiled_derivatives_of_sinc_do_not_cancel(q):
+    found = slopes(made("p**2/2 + sinc(q)"))(q, 0.0)
+    with mpmath.workdps(60):
+        x = mpmath.mpf(q or 1e-20)
+        sin, cos = mpmath.sin(x), mpmath.cos(x)
+        exact = [(x * cos - sin) / x**2, -sin / x - 2 * cos / x**2 + 2 * sin / x**3]
+    assert [found[0], found[2]] == pytest.approx([float(e) for e in exact], rel=1e-13, abs=1e-19)

@@ -292,6 +292,11 @@ class TestNumbaFunctions:
         assert np.isnan(unchecked.force(Y2[:2])).tolist() == [False, True]
         assert solve(unchecked, "verlet", (0, 1), Y2, dt=0.1).status == -1
 
+    def test_that_are_right_pass(self):
+        system = HamiltonianSystem(potential, gradient=gradient, ndof=2)
+        system.check_functions(Y2)
+        np.testing.assert_allclose(system.force(Y2[:2]), [-0.3, -2.4])
+
 
 @njit
 def lennard_jones(s):
@@ -329,3 +334,15 @@ def test_sums_over_pairs_by_numba_functions_are_those_by_a_formula():
 )
 def test_what_differences_cannot_resolve_is_not_refused(functions, y0):
     assert_accepted(y0, **functions)
+
+
+def test_one_wrong_component_of_many_is_found():
+    def gradient(q):
+        return q**3 * (1 + (np.arange(300) == 177))
+
+    assert_refused(r"its component 177 is ", np.linspace(-1, 1, 600), **QUARTIC | {"ndof": 300, "gradient": gradient})
+
+
+def test_a_contradiction_elsewhere_in_the_domain_is_found():
+    wrong = SQUARE | {"gradient": lambda q: np.where(q > 2, 2 * q, q), "domain": Ball([3.0, 0.0], 1.0)}
+    assert_refused("^`gradient` is not that of `potential`", Y1, **wrong)

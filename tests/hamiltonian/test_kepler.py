@@ -3,7 +3,9 @@
 import mpmath as mp
 import numpy as np
 import pytest
+import torch
 
+from sympflow.arrays import jvp
 from sympflow.hamiltonian.kepler import elements_of, kepler_flow, states_of
 
 EPS = np.finfo(float).eps
@@ -85,3 +87,31 @@ def test_elements_where_angles_are_not_defined(e, inclination):
     elements = np.array([1.0, e, inclination, 0.0, 0.0, 1.0])
     x, v = states_of(elements, 1.0)
     assert np.allclose(states_of(elements_of(x, v, 1.0), 1.0), (x, v), atol=1e-14)
+
+
+def test_backwards_batches_and_tensors():
+    rng = np.random.default_rng(0)
+    x, v = list(rng.normal(size=(3, 200))), list(rng.normal(size=(3, 200)))
+    t = rng.uniform(-2, 2, 200)
+    there = kepler_flow(x, v, 1.3, t)
+    back = kepler_flow(*there, 1.3, -t)
+    assert np.median(np.abs(np.array(back[0]) - x)) < 1e-14
+    one = kepler_flow([a[7] for a in x], [a[7] for a in v], 1.3, t[7])
+    assert [a[7] for a in (*there[0], *there[1])] == [*one[0], *one[1]]
+    tensors = kepler_flow(
+        *[[torch.tensor(a) for a in z] for z in (x, v)], torch.tensor(1.3, dtype=torch.float64), torch.tensor(t)
+    )
+    assert np.allclose(torch.stack(tensors[0]).numpy(), there[0], rtol=1e-9)
+
+
+def test_the_derivative_of_tensors_is_that_of_the_flow():
+    x, v = torch.tensor([1.0, 0.1, 0.2]).double(), torch.tensor([0.1, 1.0, 0.2]).double()
+    mu, t = torch.tensor(1.0).double(), torch.tensor(0.7).double()
+
+    def end(y):
+        x, v = kepler_flow([*y[:3]], [*y[3:]], mu, t)
+        return torch.stack([*x, *v])
+
+    y, w, h = torch.cat([x, v]), torch.arange(6.0).double(), 1e-5
+    _, along = jvp(end, y, w)
+    assert np.allclose(along, (end(y + h * w) - end(y - h * w)) / (2 * h), atol=1e-7)

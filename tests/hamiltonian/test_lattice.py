@@ -217,3 +217,33 @@ def test_large_systems_are_judged_by_directions():
     assert sf.symplecticity_defect(sol) < 1e-14
     with pytest.raises(ValueError, match="`directions` must be at least 3"):
         sf.symplecticity_estimate(sol, directions=2)
+
+
+@pytest.mark.filterwarnings("ignore:`dt` .* is too long")
+def test_symplecticity_by_random_directions_is_that_of_the_jacobians():
+    """‖E‖_F/√(2d) of the worst step, of a method that is not symplectic, within four standard errors."""
+    system = HamiltonianSystem.lattice(bond="r**2/2 + r**4/4", shape=5, boundary="fixed")
+    y0 = np.random.default_rng(2).uniform(-0.5, 0.5, 10)
+    sol = sf.solve(system, "euler", t_span=(0.0, 0.6), y0=y0, dt=0.3)
+    J = np.block([[np.zeros((5, 5)), np.eye(5)], [-np.eye(5), np.zeros((5, 5))]])
+    exact = 0.0
+    for _, _, A in sol.integrator.executed(system, sol.t_span, y0):
+        E = np.swapaxes(A, -1, -2) @ J @ A - J
+        exact = max(exact, np.linalg.norm(E, axis=(-2, -1)).max() / np.sqrt(10))
+    found = sf.symplecticity_estimate(sol, directions=40)
+    assert abs(found.value - exact) < 4 * found.error
+    assert found.error < 0.2 * found.value
+
+
+def test_other_values_of_parameters_give_another_lattice():
+    system = HamiltonianSystem.lattice(**DISORDERED, y0=np.full(14, 0.1))
+    other = system.with_params(b=0.7, m=np.full(7, 2.0))
+    fresh = HamiltonianSystem.lattice(
+        **{**DISORDERED, "params": {**DISORDERED["params"], "b": 0.7, "m": np.full(7, 2.0)}}
+    )
+    y = RNG.normal(size=14) * 0.5
+    np.testing.assert_array_equal(other.gradient(y), fresh.gradient(y))
+    np.testing.assert_array_equal(other.y0, system.y0)
+    assert system.params["b"] == 0.3
+    with pytest.raises(ValueError, match="`params` has 'c'"):
+        system.with_params(c=1.0)

@@ -103,3 +103,18 @@ def test_an_exponential_is_no_monomial():
     sol = solve(toda, "strang_parts", (0, 5), dt=0.05, backend="array")
     assert np.abs(sol.energy_error()).max() < 1e-2
     assert SympFlow.split(toda, 2, dt=0.05).sequence == (1, 2, 1, 2, 1)
+
+
+def test_terms_linear_in_q_move_the_center():
+    part = made("p**2/4 + 8*(q - 3)**2 + cos(q)").linear_part
+    assert part.center == pytest.approx([3.0])
+    assert part.frequencies == pytest.approx([np.sqrt(8)])
+
+
+@pytest.mark.parametrize("unit", [1e-16, 1e-8, 1.0, 1e8])
+def test_the_quadratic_part_is_the_same_in_any_unit_of_length(unit):
+    """H with a linear term, whose centre is taken out, in multiples of a unit."""
+    H = f"p**2/2 + q**2/2 + 0.1*q**3/({unit!r}) - 0.3*({unit!r})*q"
+    system = made(H, y0=[0.2 * unit, 0.0], t_span=(0, 10), dt=0.1)
+    ends = [solve(system, method).y[0, -1] / unit for method in ("linear_srkn11b", "kahan_li8")]
+    assert ends == pytest.approx([0.2910658290115, 0.2910658290115], rel=1e-10)

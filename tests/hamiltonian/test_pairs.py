@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from sympflow import HamiltonianSystem, solve, splitting_method
 from sympflow.kernels.pairs import PairCode, PairForces
@@ -75,6 +76,20 @@ class TestFunctions:
         q = np.array([[0, 2.5 - 1e-6], [0, 2.5 + 1e-6], [0, 3.0]])
         assert np.abs(two.potential(q)).max() < 1e-12
         assert np.abs(two.force(q)).max() < 1e-6
+
+    @pytest.mark.parametrize("system", [gravity(5), fluid(3, 1.5)], ids=["gravity", "Lennard-Jones"])
+    def test_of_tensors_are_derivatives_of_each_other(self, system):
+        q = torch.tensor(system.y0[: system.ndof], requires_grad=True)
+        v = torch.randn(system.ndof, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+        (slope,) = torch.autograd.grad(system.potential(q), q, create_graph=True)
+        (product,) = torch.autograd.grad(slope @ v, q, create_graph=True)
+        (bent,) = torch.autograd.grad(product @ v, q)
+        for mine, theirs in (
+            (-system.force(q), slope),
+            (system.hessian_vector(q, v), product),
+            (system.third_derivative(q, v, v), bent),
+        ):
+            torch.testing.assert_close(mine, theirs, rtol=1e-9, atol=1e-9 * float(theirs.detach().abs().max()))
 
 
 class TestRuns:
@@ -159,6 +174,15 @@ class TestRuns:
         monkeypatch.setattr(PairCode, "function", failing)
         with at_most(3), pytest.raises(MemoryError, match="no room"):
             solve(system, "verlet", (0, 1), t_eval=[1], backend="compiled")
+
+    def test_values_of_parameters_of_each_trajectory(self):
+        system = gravity(4)
+        together = solve(system, "verlet", params={"G": [0.25, 0.5]})
+        alone = solve(system.with_params(G=0.5), "verlet")
+        np.testing.assert_array_equal(together.y[1], alone.y)
+        np.testing.assert_array_equal(together.y[0], solve(system, "verlet").y)
+        with pytest.raises(ValueError, match=r"^`params` has 'g', and those of the system are G"):
+            system.with_params(g=1.0)
 
 
 @pytest.mark.parametrize(

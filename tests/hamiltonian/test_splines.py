@@ -138,3 +138,19 @@ def test_programs_with_tables_can_be_pickled():
 def test_a_spline_in_a_text_is_sent_to_functions():
     with pytest.raises(ValueError, match=r"^`expression` cannot be parsed: .* Give a potential by a function, Ham"):
         HamiltonianSystem.from_sympy("p**2/2 + V(q)", params={"V": cubic})
+
+
+def test_gradients_flow_through_compiled_runs():
+    torch = pytest.importorskip("torch")
+    system, y0 = _system("RectBivariateSpline")
+
+    def end(y):
+        return solve(system, "verlet", (0.0, 1.0), y, dt=0.05, t_eval=[1.0])
+
+    y = torch.tensor(y0, requires_grad=True)
+    sol = end(y)
+    assert sol.stats["backend"] == "compiled"
+    (found,) = torch.autograd.grad(sol.y.sum(), y)
+    h = 1e-6
+    differences = [(end(y0 + h * e).y.sum() - end(y0 - h * e).y.sum()) / (2 * h) for e in np.eye(4)]
+    np.testing.assert_allclose(found, differences, rtol=1e-8)

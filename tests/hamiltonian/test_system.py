@@ -1,6 +1,9 @@
 """HamiltonianSystem: symbolic and callable definitions agree with each other and with automatic differentiation."""
 
+import copy
+import json
 import math
+import pickle
 from fractions import Fraction
 
 import numpy as np
@@ -11,6 +14,7 @@ from conftest import refusals
 from numba import njit
 
 from sympflow import Ball, HamiltonianSystem, solve, systems, volume_error
+from sympflow.hamiltonian.symbolic import MOST_WRITTEN, generate, hessian
 
 made = HamiltonianSystem.from_sympy
 
@@ -145,6 +149,21 @@ class TestNumbaFunctions:
         assert torch.autograd.gradgradcheck(self.system.potential, q)
         fixed = q.detach()
         assert torch.autograd.gradcheck(lambda w: self.system.hessian_vector(fixed, w), v, check_forward_ad=True)
+
+    @pytest.mark.parametrize("method", ["verlet", "dopri5", "rk45", "omelyan4"])
+    def test_every_kind_of_method_runs(self, method):
+        y0 = np.array([[0.3, 0.2, 0.1, -0.2], [0.1, -0.3, 0.4, 0.1]])
+        sol = solve(self.system, method, (0, 0.5), y0)
+        splitting = method in ("verlet", "omelyan4")  # without and with force gradients, whose loops differ
+        assert sol.stats["backend"] == {"rk45": "scipy", "dopri5": "torchdiffeq"}.get(method, "compiled")
+        for system in (self.system, self.symbolic):
+            expected = solve(system, method, (0, 0.5), y0, backend="array" if splitting else "auto")
+            np.testing.assert_allclose(sol.y[..., -1], expected.y[..., -1], atol=1e-12)
+
+    def test_can_be_copied(self):
+        self.system.force(torch.zeros(2))
+        same = pickle.loads(pickle.dumps(self.system))
+        torch.testing.assert_close(same.force(torch.ones(2)), self.system.force(torch.ones(2)))
 
 
 test_bad_definitions_are_named = refusals(
@@ -311,6 +330,13 @@ class TestParameters:
         assert type(system.params["a"]) in (int, float)
         assert system.params["a"] == 2 == -system.force(np.array([1.0]))[0]
 
+    def test_survive_pickles_copies_and_json(self):
+        for again in (pickle.loads(pickle.dumps(self.system)), copy.deepcopy(self.system), copy.copy(self.system)):
+            assert again.params == {"a": 1.0}
+            with pytest.raises(TypeError, match=r"^`params`"):
+                again.params["a"] = 5.0
+        assert json.dumps(self.system.params) == '{"a": 1.0}'
+
 
 @pytest.mark.parametrize("domain", [None, Ball([0.0, 0.0], 1.0)])
 @pytest.mark.parametrize("method", ["kahan_li8", "log_kahan_li8", "tao4"])
@@ -343,3 +369,16 @@ def test_functions_of_the_wrong_kind_are_explained(potential, error, message):
     with pytest.raises(error, match=message):
         system.vector_field(np.zeros((5, 4)))
         system.hamiltonian(np.zeros((5, 4)))
+
+
+def test_hessians_of_many_variables_are_those_of_their_expressions():
+    """They are programs: the expression is differentiated as a reference."""
+    d = 20
+    bonds = " + ".join(f"k*cos(q{i} - q{i + 1})/(1 + q{i}**2) + sqrt(2 + q{i}*q{i + 1})" for i in range(1, d))
+    system = made(" + ".join(f"p{i}**2/2" for i in range(1, d + 1)) + " + " + bonds, params={"k": 0.3})
+    symbols, q = system.symbols, np.random.default_rng(0).uniform(-1, 1, size=(3, d))
+    assert d > MOST_WRITTEN
+    reference = generate(list(hessian(symbols.V, symbols.q)), symbols.q, "numpy")
+    expected = np.stack([np.broadcast_to(x, 3) for x in reference(*q.T)], axis=-1).reshape(3, d, d)
+    np.testing.assert_allclose(system.potential_hessian(q), expected, rtol=1e-13, atol=1e-14)
+    np.testing.assert_allclose(system.potential_hessian(torch.tensor(q)).numpy(), expected, rtol=1e-13, atol=1e-14)

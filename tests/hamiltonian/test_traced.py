@@ -7,6 +7,7 @@ import re
 import numpy as np
 import pytest
 import torch
+from scipy import special
 from scipy.interpolate import make_interp_spline
 from torch.nn import functional as F
 
@@ -369,3 +370,69 @@ def test_programs_can_be_read_and_pickled():
     branches = HamiltonianSystem(lambda q: q[..., 0] if q.sum() > 0 else -q[..., 0], ndof=1)
     with pytest.raises(ValueError, match=r"has no program, .*: it branches on a value: write np\.where"):
         _ = branches.program
+
+
+SPECIAL = {
+    "besselj(0, q) + bessely(2, q) + besseli(1, q) + besselk(1, q)": lambda q: (
+        special.j0(q) + special.yv(2, q) + special.iv(1, q) + special.k1(q)
+    ),
+    "gamma(q) + loggamma(q)": lambda q: special.gamma(q) + special.gammaln(q),
+    "lowergamma(2.5, q) - uppergamma(2.5, q)": lambda q: (
+        special.gamma(2.5) * (special.gammainc(2.5, q) - special.gammaincc(2.5, q))
+    ),
+    "elliptic_k(q/4) + Ei(q)": lambda q: special.ellipk(q / 4) + special.expi(q),
+    "log10(q) + log2(q) + log1p(q) + hypot(q, 2)": lambda q: np.log10(q) + np.log2(q) + np.log1p(q) + np.hypot(q, 2),
+    "erf(q) + erfc(q/2)": lambda q: special.erf(q) + special.erfc(q / 2),
+}
+
+
+@pytest.mark.parametrize("text", SPECIAL)
+def test_special_functions_are_compiled(text):
+    given = HamiltonianSystem(lambda q: SPECIAL[text](q[..., 0]), ndof=1, y0=[1.3, 0.1])
+    system = HamiltonianSystem.from_sympy(f"p**2/2 + {text}", y0=[1.3, 0.1])
+    q = np.linspace(0.4, 1.7, 9)[:, None]
+    np.testing.assert_allclose(given.force(q), system.force(q), rtol=1e-12)
+    for method in ("verlet", "srkn11b", "gauss_legendre4"):
+        runs = [solve(s, method, (0, 0.4), dt=0.05) for s in (given, system)]
+        assert [run.stats["backend"] for run in runs] == ["compiled"] * 2
+        reference = solve(system, method, (0, 0.4), dt=0.05, backend="array")
+        for run in runs:
+            np.testing.assert_allclose(run.y, reference.y, rtol=1e-12)
+
+
+SUMS = {
+    "plain": (lambda q, p: (p**2 / M[:2]).sum(-1) / 2 + (q**4).sum(-1) / 4, "p1**2/2 + p2**2/4 + (q1**4 + q2**4)/4"),
+    "joint": (lambda q, p: 0.5 * (p @ np.array([[2.0, 0.5], [0.5, 1.0]]) * p + q**2).sum(-1),
+              "p1**2 + p1*p2/2 + p2**2/2 + (q1**2 + q2**2)/2"),
+    "relativistic": (lambda q, p: torch.sqrt(1 + (p**2).sum(-1)) + torch.cos(q[..., 0]) + q[..., 1] ** 2,
+                     "sqrt(1 + p1**2 + p2**2) + cos(q1) + q2**2"),
+    "shifted": (lambda q, p: ((p - 0.3) ** 2).sum(-1) / 2 - (q**2).sum(-1) / 2,
+                "((p1 - 0.3)**2 + (p2 - 0.3)**2)/2 - (q1**2 + q2**2)/2"),
+    "infinite at rest": (lambda q, p: (p * np.log(p) + q**2).sum(-1), "p1*log(p1) + p2*log(p2) + q1**2 + q2**2"),
+    "driven": (lambda t, q, p: (p**2).sum(-1) / 2 + np.sin(t) * q[..., 0] + (q**2).sum(-1),
+               "(p1**2 + p2**2)/2 + sin(t)*q1 + q1**2 + q2**2"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", SUMS)
+def test_a_sum_in_one_function_is_separable_as_it_is_by_text(name):
+    function, text = SUMS[name]
+    driven = name == "driven"
+    found = HamiltonianSystem(hamiltonian=function, ndof=2, y0=Y0, time=driven)
+    expected = HamiltonianSystem.from_sympy(text, y0=Y0, time="t" if driven else None)
+    assert (found.separable, found.quadratic_kinetic) == (True, expected.quadratic_kinetic)
+    time = (0.3,) * driven
+    np.testing.assert_allclose(found.hamiltonian(Y0, *time), expected.hamiltonian(Y0, *time), rtol=1e-15)
+    for method in ("verlet", "kahan_li8", "tao4", "gauss_legendre4"):
+        for backend in ("compiled", "array"):
+            ends = [solve(s, method, (0, 1), dt=0.1, backend=backend).y[:, -1] for s in (found, expected)]
+            np.testing.assert_allclose(*ends, rtol=0, atol=1e-13)
+
+
+def test_a_mass_within_one_function_that_has_changed_is_refused():
+    mass = [1.0]
+    system = HamiltonianSystem(hamiltonian=lambda q, p: (p**2).sum(-1) / mass[0] + (q**2).sum(-1), ndof=2, y0=Y0)
+    solve(system, "verlet", (0, 1), dt=0.1)
+    mass[0] = 2.0
+    with pytest.raises(ValueError, match=r"^`hamiltonian` has another value than when it was traced"):
+        solve(system, "verlet", (0, 1), dt=0.1)

@@ -191,3 +191,30 @@ def test_a_step_is_doubted_for_motions_that_there_are(sign, slow):
     error = np.abs(sol.y[0] - common - apart).max()
     assert ["rate of the motion is 14.2" in str(warning.message) for warning in told] == [True] * (not slow)
     assert error < 0.01 if slow else error > 1
+
+
+@pytest.mark.parametrize(("method", "tol"), [("verlet", 1e-4), ("srkn11b", 1e-6), ("kahan_li8", 1e-9)])
+def test_the_balance_is_that_of_chaotic_orbits_too(method, tol):
+    """Two runs of Duffing's oscillator differ by 1 % of the energy after T = 100 with steps that keep it to `tol`."""
+    sol = solve(systems.duffing(), method, (0, 100), tol=tol)
+    assert sol.stats["energy_error"] <= tol
+    coarser = solve(systems.duffing(), method, (0, 100), dt=4 * sol.stats["dt"], diagnose=False)
+    assert np.abs(coarser.energy()[-1] - sol.energy()[-1]) > 10 * tol
+
+
+def test_the_error_of_states_can_be_asked_for():
+    system = systems.henon_heiles()
+    dt = choose_step(system, "srkn11b", 1e-8, t_span=(0, 40), tol_of="state")
+    sol = solve(system, "srkn11b", (0, 40), dt=dt)
+    assert sympflow.reference_error(sol).max() <= 1e-8
+    assert dt < choose_step(system, "srkn11b", 1e-8, t_span=(0, 40))
+
+
+@pytest.mark.parametrize("unit", [1e-20, 1e12])
+def test_steps_scale_with_the_unit_of_time(unit):
+    """H = ½ p² + ½ (q/T)²: with times in units of T the steps are the same."""
+    steps = []
+    for T in (1.0, unit):
+        system = text("p**2/2 + q**2/(2*T**2)", params={"T": T}, y0=[1, 0.5 / T], t_span=(0, 100 * T))
+        steps.append([system.dt / T, choose_step(system, "kahan_li8", 1e-9) / T])
+    np.testing.assert_allclose(steps[1], steps[0], rtol=1e-2)

@@ -50,3 +50,14 @@ def test_a_run_goes_back_is_thinned_and_pickled(system):
     t = np.linspace(0, 2, 7)
     np.testing.assert_array_equal(same.sol(t), forward.sol(t))
     assert sympflow.symplecticity_defect(same) < 1e-13
+
+
+@pytest.mark.slow
+def test_a_run_is_symplectic_on_the_two_copies_and_keeps_the_energy(system):
+    sol = sympflow.solve(system, "tao4", (0, 200), dt=0.05, t_eval=np.linspace(0, 200, 401))
+    assert sympflow.symplecticity_defect(sol) < 1e-13
+    assert abs(sympflow.volume_error(sol)) < 1e-10
+    error = np.abs(sol.energy_error())
+    assert error.max() < 1e-4
+    assert error[200:].max() < 2 * error[:200].max()  # no drift
+    assert sol.stats["copy_distance"] < 1e-2

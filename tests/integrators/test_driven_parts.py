@@ -50,3 +50,12 @@ def test_every_splitting_keeps_its_order(system, method, options):
         for dt in steps
     ]
     assert np.log2(errors[0] / errors[1]) > order - 0.35
+
+
+@pytest.mark.parametrize(("system", "method"), [(LINEAR, "linear_omelyan4"), (POLAR, "strang_parts")])
+def test_a_step_has_its_inverse_at_its_time(system, method):
+    integrator, t = get(method)(), np.array([0.4, 1.3])
+    y = np.stack([system.y0, 1.1 * np.asarray(system.y0)])
+    end = integrator.step(system, t, y, 0.1)
+    assert np.abs(end[1] - integrator.step(system, 1.3, y[1], 0.1)).max() < 1e-15
+    assert np.abs(integrator.inverse(system, t, end, 0.1) - y).max() < 1e-15

@@ -1,5 +1,8 @@
 """Friction p' = −∂H/∂q − Γp: exact drifts, orders, conformal symplecticity; what leaves it out refuses it."""
 
+from dataclasses import dataclass
+from typing import ClassVar
+
 import numpy as np
 import pytest
 import scipy.linalg
@@ -8,8 +11,9 @@ import torch
 import sympflow
 from sympflow import HamiltonianSystem, solve
 from sympflow.hamiltonian.friction import Friction
+from sympflow.integrators.base import FixedStep
 from sympflow.schemes import SCHEMES
-from sympflow.systems import damped_pendulum
+from sympflow.systems import damped_oscillator, damped_pendulum, pendulum
 
 EVERY_SCHEME = pytest.mark.parametrize("name", SCHEMES)
 MATRIX = np.array([[0.5, 0.3], [0.3, 0.4]])
@@ -161,3 +165,112 @@ def test_gauss_methods_are_conformally_symplectic_for_any_h(name):
 
 
 # what does not hold, or is for later --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("damping", [0.3, [0.3, 0.1], MATRIX])
+@pytest.mark.parametrize("separable", [True, False])
+def test_the_vector_field_has_friction_and_its_jacobian(damping, separable):
+    H = "p1**2/2 + p2**2/4 + q1**4/4 + q2**2" + ("" if separable else " + q1*p2")
+    damped, plain = HamiltonianSystem.from_sympy(H, damping=damping), HamiltonianSystem.from_sympy(H)
+    y = np.linspace(-1, 1, 12).reshape(3, 4)
+    G = np.asarray(damping) if np.ndim(damping) == 2 else np.diag(np.broadcast_to(damping, 2))
+    expected = plain.vector_field(y) - np.concatenate([np.zeros((3, 2)), y[:, 2:] @ G], axis=1)
+    np.testing.assert_allclose(damped(0.0, y), expected, rtol=1e-15, atol=1e-15)
+    np.testing.assert_allclose(damped.vector_field(torch.tensor(y)).numpy(), expected, rtol=1e-15, atol=1e-15)
+    jacobian = torch.func.vmap(torch.func.jacfwd(damped.vector_field))(torch.tensor(y)).numpy()
+    np.testing.assert_allclose(damped.field_jacobian(y), jacobian, rtol=1e-14, atol=1e-14)
+
+
+def oscillator(t, omega, rate, q0, p0):
+    """The known truth of `damped_oscillator`."""
+    W = np.sqrt(complex(omega**2 - rate**2 / 4))
+    A = np.array([[0.0, 1.0], [-(omega**2), -rate]])
+    q = np.exp(-rate * t / 2) * (q0 * np.cos(W * t) + (p0 + rate * q0 / 2) * np.sin(W * t) / W)
+    np.testing.assert_allclose(scipy.linalg.expm(A * t)[0] @ [q0, p0], q.real, atol=1e-12)
+    return scipy.linalg.expm(A * t) @ [q0, p0]
+
+
+@EVERY_SCHEME
+def test_the_damped_oscillator_is_solved_compiled(name):
+    system = damped_oscillator(2.0, 0.3)
+    sol = solve(system, name, (0, 3.0), dt=0.02)
+    assert sol.stats["backend"] == "compiled"
+    truth = oscillator(3.0, 2.0, 0.3, 1.0, 0.0)
+    close = {2: 2e-3, 4: 1e-4, 6: 1e-8, 8: 1e-11}[SCHEMES[name].order]
+    assert np.abs(sol.y[:, -1] - truth).max() < close
+    back = solve(system, name, (3.0, 0.0), truth, dt=0.02).y[:, -1]  # back in time it grows
+    assert np.abs(back - system.y0).max() < np.exp(0.3 * 3.0) * close
+    arrays = solve(system, name, (0, 3.0), dt=0.02, backend="array")
+    np.testing.assert_allclose(sol.y, arrays.y, atol=2e-14)
+
+
+def test_compiled_gauss_methods_with_friction_are_those_of_arrays(ends):
+    (turning, _), (two, _), (coupled, _) = ends
+    for system in (turning, two):
+        y0 = np.stack([system.y0, 0.5 * system.y0])
+        compiled, arrays = (
+            solve(system, "gauss_legendre4", (0, 4.0), y0, dt=0.2, backend=backend) for backend in ("compiled", "array")
+        )
+        np.testing.assert_allclose(compiled.y, arrays.y, rtol=0, atol=1e-13)
+    back = solve(turning, "gauss_legendre4", (4.0, 0.0), solve(turning, "gauss_legendre4", (0, 4.0)).y[:, -1])
+    np.testing.assert_allclose(back.y[:, -1], turning.y0, atol=1e-12)
+    assert solve(coupled, "gauss_legendre4", (0, 0.4), dt=0.2).stats["backend"] == "numpy"
+    with pytest.raises(ValueError, match="is a matrix"):
+        solve(coupled, "gauss_legendre4", (0, 0.4), dt=0.2, backend="compiled")
+
+
+def test_everything_else_refuses_friction():
+    damped, system = damped_pendulum(), pendulum()
+    flow = sympflow.shipped_flows(system)[0].load(system)
+    y = np.array([1.0, 0.5])
+    for use in (
+        lambda: sympflow.train(damped, kind="sympflow", steps=1),
+        lambda: sympflow.SympFlow.split(damped_oscillator(), 0.5),
+        lambda: solve(damped, flow),
+        lambda: solve(damped, "sympflow"),
+        lambda: solve(damped, "sympflow", flow=flow),
+        lambda: flow.check_system(damped),
+        lambda: flow.certificate(damped),
+        lambda: sympflow.time_transformed(damped),
+        lambda: damped_oscillator().linear_part,
+        lambda: sympflow.stability(damped, ["verlet"]),
+        lambda: sympflow.compare(damped, ["verlet"], ["volume"]),
+        lambda: sympflow.get("verlet")(splitting="copies").step(damped, 0.0, y, 0.1),
+        lambda: sympflow.get("strang_parts")().step(damped_oscillator(), 0.0, y, 0.1),
+        lambda: sympflow.get("log_leapfrog")().step(damped, 0.0, y, 0.1),
+    ):
+        with pytest.raises(ValueError, match="has friction"):
+            use()
+    assert not flow.matches(damped)
+    assert len(sympflow.shipped_flows(damped)) == 0
+    with pytest.raises(ValueError, match=r"^`compensated`"):
+        solve(damped, "verlet", compensated=True)
+    relativistic = HamiltonianSystem.from_sympy("sqrt(1 + p**2) - cos(q)", damping=0.1, y0=[1.0, 0.0])
+    with pytest.raises(ValueError, match=r"kinetic energy is ½ pᵀM⁻¹p"):
+        solve(relativistic, "verlet")
+
+
+@dataclass(frozen=True)
+class Stepping(FixedStep):
+    """Verlet's steps of another system than the run's."""
+
+    other: HamiltonianSystem = None
+    name: ClassVar[str] = "of_another_system"
+    order: ClassVar[int] = 2
+    symplectic: ClassVar[bool] = False
+
+    def __init__(self, other, dt):
+        object.__setattr__(self, "other", other)
+        object.__setattr__(self, "dt", dt)
+
+    def step(self, system, t, y, h):
+        return sympflow.get("verlet")().step(self.other, t, y, h)
+
+
+def test_the_conformal_defect_sees_another_rate():
+    sol = solve(damped_pendulum(0.3), "verlet", (0, 1.0), dt=0.1)
+    other = solve(damped_pendulum(0.31), "verlet", (0, 1.0), dt=0.1)
+    mixed = type(sol)(**{**vars(sol), "integrator": Stepping(other.system, dt=0.1)})
+    assert sympflow.conformal_defect(mixed) == pytest.approx(np.exp(-0.03) - np.exp(-0.031), rel=1e-6)
+    plain = solve(pendulum(), "verlet", (0, 1.0), dt=0.1)
+    assert sympflow.conformal_defect(plain) == sympflow.symplecticity_defect(plain)

@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy.interpolate import CubicSpline
 
-from sympflow import HamiltonianSystem, get, solve
+from sympflow import Box, HamiltonianSystem, get, solve
 from sympflow.flow.shipped import named
 from sympflow.kernels import reverse
 from sympflow.systems import driven_pendulum, henon_heiles
@@ -417,3 +417,109 @@ def test_masses_of_bodies_are_parameters_of_a_run():
     for wrong, message in (([1.0, 2.0], "one for each of the 3 bodies"), ([1.0, 0.0, 1.0], "not positive")):
         with pytest.raises(ValueError, match=f"^`params` has masses .*{message}"):
             solve(system, "verlet", (0.0, 1.0), y0, dt=0.01, params={"masses": wrong})
+
+
+def test_first_and_second_derivatives():
+    y0 = torch.tensor(start(CUBIC, (2,)), requires_grad=True)
+    k = torch.tensor(1.0, dtype=torch.float64, requires_grad=True)
+
+    def states(y, k):
+        return solve(CUBIC, "srkn6b", (0, 0.3), y, dt=0.1, t_eval=[0.13, 0.3], params={"k": k}).y
+
+    assert torch.autograd.gradcheck(states, (y0, k))
+    assert torch.autograd.gradgradcheck(states, (y0, k))
+
+
+def test_a_chaotic_run():
+    """Finite differences of the compiled run itself: arrays have other states there."""
+    y0 = np.array([0.0, 0.1, 0.47, 0.1])
+    system = HamiltonianSystem.from_sympy("(p1**2 + p2**2)/2 + (q1**2 + q2**2)/2 + q1**2*q2 - q2**3/3")
+    run = {"t_span": (0, 100), "dt": 0.05, "t_eval": [100.0]}
+    y = torch.tensor(y0, requires_grad=True)
+    (gradient,) = torch.autograd.grad(weighted(solve(system, "verlet", y0=y, **run)), y)
+    columns, h = [], 1e-7
+    for e in np.eye(4):
+        columns.append([float(weighted(solve(system, "verlet", y0=y0 + s * h * e, **run))) for s in (1, -1)])
+    difference = (np.array(columns)[:, 0] - np.array(columns)[:, 1]) / (2 * h)
+    np.testing.assert_allclose(gradient.numpy(), difference, rtol=1e-4, atol=1e-4 * np.abs(difference).max())
+
+
+def test_rows_that_become_infinite_leave_the_others_alone():
+    y0 = np.array([[0.1, 0.0, 0.2, 0.1], [0.0, 30.0, 0.0, 30.0], [0.0, 0.1, 0.3, 0.0]])
+    y = torch.tensor(y0, requires_grad=True)
+    sol = solve(CUBIC, "verlet", (0, 2), y, dt=0.1, diagnose=False)
+    assert list(sol.status) == [0, -1, 0]
+    (gradient,) = torch.autograd.grad(sol.y[[0, 2], :, -1].sum() + sol.y[1, :, 1].sum(), y)
+    for row, last in ((0, -1), (1, 1), (2, -1)):
+        alone = torch.tensor(y0[row], requires_grad=True)
+        t_eval = sol.t[: 2 if last == 1 else None]
+        part = solve(CUBIC, "verlet", (0, 2), alone, dt=0.1, t_eval=t_eval, diagnose=False)
+        expected = torch.autograd.grad(part.y[:, last].sum(), alone)[0]
+        torch.testing.assert_close(gradient[row], expected, rtol=1e-12, atol=0)
+
+
+@pytest.mark.parametrize("method", ["verlet", "rk4", "gauss_legendre4"])
+def test_transforms_of_runs(method):
+    """Jacobians and Hessians of a compiled run by torch.func, forward and reverse, by tensor operations."""
+    y0 = torch.tensor(start(CUBIC, ()))
+
+    def end(y):
+        return solve(CUBIC, method, (0, 0.5), y, dt=0.1, t_eval=[0.5]).y[:, 0]
+
+    J = torch.autograd.functional.jacobian(end, y0)
+    for each in (torch.func.jacrev(end)(y0), torch.func.jacfwd(end)(y0)):
+        torch.testing.assert_close(each, J, rtol=1e-12, atol=1e-13)
+    H = torch.autograd.functional.hessian(lambda y: (end(y) ** 2).sum(), y0)
+    torch.testing.assert_close(torch.func.hessian(lambda y: (end(y) ** 2).sum())(y0), H, rtol=1e-11, atol=1e-12)
+    with pytest.raises(TypeError, match=r"^`params` has k that torch\.func"):
+        torch.func.jvp(lambda k: solve(CUBIC, method, (0, 1), y0, dt=0.1, params={"k": k}).y, (ONE,), (ONE,))
+
+
+def test_dense_output_has_the_gradients_of_outputs():
+    found = []
+    for more in ({"dense_output": True}, {"t_eval": [1.234]}):
+        y = torch.tensor(start(CUBIC, ()), requires_grad=True)
+        sol = solve(CUBIC, "srkn6b", (0, 2), y, dt=0.1, **more)
+        state = sol.y[:, 0] if not sol.sol else sol.sol(1.234)
+        found.append(torch.autograd.grad(state.sum(), y)[0])
+    torch.testing.assert_close(*found, rtol=1e-13, atol=0)
+
+
+def test_weights_are_arguments():
+    """A step of an optimizer changes the run, and nothing is compiled again; what is not followed is refused."""
+    net, V = network("two layers")
+    system, y0 = HamiltonianSystem(V, ndof=2), start(CUBIC, (3,))
+    solve(system, "verlet", (0, 1), y0, dt=0.1)
+    with torch.no_grad():
+        net[2].weight *= 1.5
+    again = solve(system, "verlet", (0, 1), y0, dt=0.1)
+    np.testing.assert_array_equal(again.y, solve(HamiltonianSystem(V, ndof=2), "verlet", (0, 1), y0, dt=0.1).y)
+    net[2] = torch.nn.Linear(9, 8).double()
+    with pytest.raises(ValueError, match=r"^`potential` has another value than when it was traced"):
+        solve(system, "verlet", (0, 1), y0, dt=0.1)
+
+
+def test_second_derivatives_by_weights_through_two_runs():
+    net, V = network("two layers")
+    system, found = HamiltonianSystem(V, ndof=2), []
+    for backend in ("compiled", "array"):
+        middle = solve(system, "verlet", (0, 0.5), torch.tensor(start(system, (2,))), dt=0.1, backend=backend).y[
+            ..., -1
+        ]
+        end = solve(system, "verlet", (0, 0.5), middle, dt=0.1, t_eval=[0.5], backend=backend).y
+        first = torch.autograd.grad((end**2).sum(), [p for p in net.parameters() if p.numel() > 1], create_graph=True)
+        found.append(torch.autograd.grad(sum((g**2).sum() for g in first), net[2].weight)[0])
+    torch.testing.assert_close(*found, rtol=1e-11, atol=1e-14)
+
+
+@pytest.mark.parametrize("asked", [{"events": lambda t, y: y[0] - 0.05}, {"on_domain_exit": "stop"}])
+def test_outputs_have_the_same_gradients_with_events_and_up_to_a_stop(asked):
+    system = HamiltonianSystem.from_sympy("(p**2 + q**2)/2", domain=Box([-1, -0.35], [1, 1]))
+    found = []
+    for more in (asked, {}):
+        y = torch.tensor([0.3, 0.2], dtype=torch.float64, requires_grad=True)
+        sol = solve(system, "verlet", (0, 3), y, dt=0.07, **more)
+        n = len(found[0][0]) if found else len(sol.t)
+        found.append((sol.t[:n], torch.autograd.grad(sol.y[:, n // 2].sum() + sol.y[0, n - 1], y)[0]))
+    assert (n < len(sol.t)) == ("on_domain_exit" in asked)
+    torch.testing.assert_close(found[0][1], found[1][1], rtol=1e-14, atol=0)

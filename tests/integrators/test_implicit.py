@@ -91,3 +91,26 @@ def test_compensated_sums_need_compiled_loops_and_lower_the_rounding():
     assert rms[1] < 0.5 * rms[0]
     with pytest.raises(ValueError, match=r"^`compensated` sums need compiled loops"):
         solve(pendulum, "gauss_legendre4", (0.0, 1.0), compensated=True, backend="array")
+
+
+@pytest.mark.parametrize("method", ["gauss_legendre6", "gauss_legendre8"])
+def test_the_energy_error_of_many_steps_is_rounding_without_drift(method):
+    n = 50_000
+    error = solve(TURNING, method, (0.0, 0.02 * n), dt=0.02, save_every=50).energy_error()
+    truncation = 0 if get(method).order == 8 else 1e-14
+    assert np.abs(error).max() < 10 * EPS * np.sqrt(n) + truncation
+
+
+@pytest.mark.parametrize(
+    ("method", "backend"),
+    [
+        *zip(METHODS, ["compiled", "array"] * 2, strict=True),
+        *(pytest.param(m, "compiled", marks=pytest.mark.slow) for m in METHODS[1::2]),
+    ],
+)
+@pytest.mark.parametrize("z", [20.0, 1e3])
+def test_no_step_is_too_long_for_an_oscillator(method, backend, z):
+    omega, n = 1e6, {"compiled": 10_000, "array": 300}[backend]
+    sol = solve(systems.harmonic_oscillator(omega), method, (0.0, n * z / omega), dt=z / omega, backend=backend)
+    assert max_energy_error(sol) < 100 * EPS * np.sqrt(n)
+    assert sol.stats["newton_iterations"] == 2 * n  # a linear system is solved at once; the second finds nothing left

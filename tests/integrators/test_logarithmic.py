@@ -3,7 +3,18 @@
 import numpy as np
 import pytest
 
-from sympflow import ClockedFit, HamiltonianSystem, get, load, max_energy_error, shipped_flows, solve, systems, train
+from sympflow import (
+    ClockedFit,
+    HamiltonianSystem,
+    get,
+    load,
+    max_energy_error,
+    shipped_flows,
+    solve,
+    systems,
+    time_transformed,
+    train,
+)
 from sympflow.integrators.base import Problem
 from sympflow.integrators.clocks import PhysicalRun
 from sympflow.integrators.flows import LogSympFlow
@@ -141,3 +152,99 @@ def test_float32_and_functions_run_with_arrays():
     single = solve(kepler, "log_leapfrog", (0.0, 7.0), dt=0.02, t_eval=times, dtype="float32")
     assert single.y.dtype == np.float32
     np.testing.assert_allclose(single.y, reference.y, rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize(("method", "order"), [("log_leapfrog", 2), ("log_blanes_moan4", 4)])
+def test_outputs_are_at_physical_times(method, order):
+    e, kepler, period = 0.9, systems.kepler(0.9), 2 * np.pi
+    anomaly = np.linspace(0, 2 * np.pi, 9)
+    times = anomaly - e * np.sin(anomaly)
+    errors = [
+        np.abs(solve(kepler, method, (0, period), dt=period / n, t_eval=times).y.T - kepler_ellipse(e, anomaly))
+        for n in (400, 800)
+    ]
+    assert errors[1].max() < errors[0].max() / 2 ** (order - 0.3)
+
+
+def test_the_time_of_an_output_is_met_to_rounding():
+    # where the ellipse is followed exactly, the state tells the time that the leapfrog has for it
+    kepler = systems.kepler(0.9)
+    transformed = time_transformed(kepler)
+    run = solve(transformed, "leapfrog", (0.0, 2.0), dt=0.01)
+    t, y = run.y[2], run.y[[0, 1, 3, 4]]
+    sol = solve(kepler, "log_leapfrog", (0.0, float(t[-1])), dt=0.01, t_eval=t)  # ds = dt·2|E| = dt
+    speed = np.abs(np.diff(y) / np.diff(t)).max()
+    assert np.abs(sol.y - y).max() < 1e-12 * speed
+    assert np.array_equal(sol.t, t)
+
+
+METHODS = ("log_leapfrog", "log_blanes_moan4", "log_kahan_li8")
+
+
+MASSES, PLACES = (3, 4, 5), ((1, 3), (-2, -1), (1, -1))
+
+
+PYTHAGOREAN = HamiltonianSystem.from_sympy(
+    "+".join(f"(p{2 * i + 1}**2 + p{2 * i + 2}**2)/{2 * MASSES[i]}" for i in range(3))
+    + "".join(
+        f" - {MASSES[i] * MASSES[j]}/sqrt((q{2 * i + 1} - q{2 * j + 1})**2 + (q{2 * i + 2} - q{2 * j + 2})**2)"
+        for i in range(3)
+        for j in range(i + 1, 3)
+    ),
+    y0=[*np.ravel(PLACES), *[0.0] * 6],
+    t_span=(0.0, 70.0),
+    dt=1e-3,
+)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", METHODS)
+def test_a_close_binary_and_its_escape(method):
+    limits = {"log_leapfrog": (1e-3, None), "log_blanes_moan4": (1e-5, 0.1), "log_kahan_li8": (1e-9, 1e-2)}
+    energy, state = limits[method]
+    sol = solve(PYTHAGOREAN, method, t_eval=[15.83, 35.0, 70.0])
+    assert max_energy_error(sol) < energy
+    reference = [6.933464, 20.261804, -2.003006, -6.872463, -2.557673, -6.659112]  # 128-bit arithmetic
+    if state is not None:
+        assert np.abs(sol.q[:, -1] - reference).max() < state
+
+
+def test_the_transformed_functions_are_the_derivatives_of_each_other():
+    functions = HamiltonianSystem(
+        potential=lambda q: -1 / (q**2).sum(-1).sqrt(), ndof=2, y0=systems.kepler(0.6).y0, name="functions"
+    )
+    symbolic, plain = time_transformed(systems.kepler(0.6)), time_transformed(functions)
+    x = np.array([[0.3, 0.4, 1.0, -0.2, 0.9, 0.7], [1.0, 0.2, -3.0, 0.1, 0.4, 0.5]])
+    for name in ("hamiltonian", "gradient", "hessian"):
+        np.testing.assert_allclose(getattr(plain, name)(x), getattr(symbolic, name)(x), rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(symbolic.hamiltonian(symbolic.y0), 0.0, atol=1e-14)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_events_are_found_in_physical_time(sign):
+    """An orbit of period 2π crosses its axis each half of it."""
+    sol = solve(systems.kepler(0.9), "log_kahan_li8", (0.0, sign * 20.0), events=lambda t, y: y[1])
+    np.testing.assert_allclose(sol.t_events[0], sign * np.pi * np.arange(7), rtol=0, atol=1e-9)
+
+
+def test_a_trajectory_of_a_batch_is_the_one_alone(monkeypatch):
+    kepler, options = systems.kepler(), {"t_span": (0.0, 40.0), "t_eval": [13.0, 40.0], "dt": 0.1}
+    y0 = kepler.domain.sample(40, 2)
+    alone = [solve(kepler, "log_leapfrog", y0=y, **options).y for y in y0]
+    monkeypatch.setattr("sympflow.integrators.clocks.LARGEST_CHUNK", 4000)  # so that chunks are others
+    np.testing.assert_array_equal(solve(kepler, "log_leapfrog", y0=y0, **options).y, alone)
+
+
+@pytest.mark.parametrize("backend", ["array", "auto"])
+@pytest.mark.slow
+def test_states_of_an_infinite_energy(backend):
+    """V that overflows is refused; T that does is a run that fails at its start, whatever is asked of it."""
+    system, still = systems.henon_heiles(), [0.0, 0.0, 0.0]
+    for y0 in ([0.0, -2e154, 0.0, 0.0], [0.0, -1e200, 0.0, 1e200], [[*still, 0.1], [0.0, -1e308, 0.0, 0.0]]):
+        with pytest.raises(ValueError, match=r"^`y0` has the energy inf: give a state of a finite one\."):
+            solve(system, "log_leapfrog", (0.0, 0.2), y0=y0, backend=backend)
+    for asked in ({}, {"t_eval": [0.1, 0.2]}, {"dense_output": True}):
+        sol = solve(system, "log_leapfrog", (0.0, 0.2), y0=[*still, 2e154], backend=backend, **asked)
+        assert (sol.status, sol.stats["failed_at"]) == (-1, 0.0)
+    batch = solve(system, "log_leapfrog", (0.0, 0.2), y0=[[*still, 0.1], [*still, 2e154]], backend=backend)
+    assert batch.status.tolist() == [0, -1]

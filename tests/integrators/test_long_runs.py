@@ -130,3 +130,14 @@ def test_ctrl_c_and_progress_on_the_logarithmic_clock(monkeypatch, options, batc
     known = sol.t <= until
     np.testing.assert_array_equal(sol.t[known], whole.t[:n][known])
     np.testing.assert_array_equal(sol.y[..., known], whole.y[..., :n][..., known])
+
+
+def test_a_run_that_fails_in_a_window_ends_as_in_one_piece(short_windows):
+    y0 = np.array([BATCH[0], [0.0, 1.5, 1.0, 1.0], BATCH[1]])
+    for start in (y0, y0[1]):
+        whole = solve(SYSTEM, "verlet", SPAN, start, dt=DT)
+        cut = solve(SYSTEM, "verlet", SPAN, start, dt=DT, progress=Told())
+        np.testing.assert_array_equal(cut.y, whole.y)
+        np.testing.assert_array_equal(cut.status, whole.status)
+        np.testing.assert_array_equal(cut.stats["failed_at"], whole.stats["failed_at"])
+        assert cut.message == whole.message

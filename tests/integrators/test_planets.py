@@ -10,6 +10,7 @@ from sympflow import HamiltonianSystem, gali, lyapunov, solve, splitting_method,
 from sympflow.arrays import jvp
 from sympflow.kernels.protocol import RunCheckpoint
 from sympflow.schemes import CORRECTORS, corrector_maps
+from sympflow.testing import check_integrator
 
 EPS = np.finfo(float).eps
 METHODS = ("wisdom_holman", "kepler_aba104", "kepler_aba864", "kepler_aba1064")
@@ -382,3 +383,162 @@ def test_threads_share_bodies_without_mass(compensated):
             runs.append((first.states, last.states, last.n_finite, kernel.remark))
         for one, other in zip(*runs, strict=True):
             assert np.array_equal(one, other, equal_nan=not isinstance(one, str))
+
+
+@pytest.mark.slow
+def test_the_contract_of_integrators():
+    """A star with heavy companions, whose momenta are of the size of the differences that the checks make."""
+    orbits = {"a": [1.5, 9.0], "e": [0.1, 0.05], "inc": [0.02, 0.04], "M": [0.0, 2.0]}
+    system = HamiltonianSystem.planets([2.0, 0.5, 0.4], elements=orbits, t_span=(0, 60.0), dt=0.3, encounter=None)
+    around = solve(system, "srkn11b", (0, 300.0), dt=0.05, save_every=20).y.T
+    system = system.with_scene(domain=sympflow.Tube(around, 0.02))
+    report = check_integrator(sympflow.get("wisdom_holman"), system)
+    assert set(report.skipped) == {"friction_is_in_the_steps", "the_drive_is_in_the_steps"}
+
+
+@pytest.mark.parametrize("factor", [1, 100])
+@pytest.mark.parametrize(
+    ("method", "power"), [("wisdom_holman", 2), ("kepler_aba104", 4), ("kepler_aba864", 4), (BENT, 4)]
+)
+def test_the_error_grows_with_the_step_and_the_masses(method, power, factor):
+    """The leading error is ε dt² (Wisdom and Holman 1991); of the others ε² dt⁴, beside ε with high powers of dt."""
+    masses = [1.0, *(factor * 1e-2 * np.array(MASSES[1:]))]
+    system = HamiltonianSystem.planets(masses, elements=ELEMENTS, G=GAUSS)
+    errors = []
+    for dt in (200.0, 100.0):
+        H = system.hamiltonian(solve(system, method, (0, 60_000.0), dt=dt).y.T)
+        errors.append(np.abs(H / H[0] - 1).max())
+    assert errors[0] < 1e-4 * factor
+    if errors[1] > 100 * EPS:
+        assert np.log2(errors[0] / errors[1]) > power - 0.7
+
+
+def test_force_gradients_remove_errors_of_second_order_in_the_masses():
+    """With a corrector the error is ε² dt² of plain kicks, and ε² dt⁴ (Wisdom, Holman and Touma 1996)."""
+    errors = []
+    for method in ("wisdom_holman", MODIFIED):
+        for dt in (60.0, 120.0):
+            given = {"dt": dt, "t_span": (0, 1.2e6), "save_every": 50, "on_domain_exit": "ignore"}
+            errors.append(np.abs(solve(OUTER, method, corrector=17, **given).energy_error()).max())
+    assert errors[2] < 0.01 * errors[0]
+    assert np.log2(errors[1] / errors[0]) == pytest.approx(2, abs=0.6)
+    assert np.log2(errors[3] / errors[2]) > 3.3
+
+
+def test_momentum_and_angular_momentum_are_kept():
+    sol = solve(GIANTS, "kepler_aba864", (0, 400_000.0), dt=100.0, save_every=100)
+    q, p = (x.reshape(4, 3, -1) for x in (sol.y[:12], sol.y[12:]))
+    L = np.cross(q, p, axis=1).sum(0)
+    assert np.abs(p.sum(0)).max() < 1e-15 * np.abs(p).max() * 50
+    assert np.abs(L - L[:, :1]).max() < 1e-12 * np.linalg.norm(L[:, 0])
+    moving = GIANTS.y0 + np.concatenate([np.tile([1.0, 2.0, 3.0], 4), np.outer(MASSES, [1e-3, 0, 2e-3]).ravel()])
+    other = solve(GIANTS, "kepler_aba864", (0, 4000.0), dt=100.0, y0=moving)
+    still = solve(GIANTS, "kepler_aba864", (0, 4000.0), dt=100.0)
+    away = (other.y - still.y)[:12].reshape(4, 3, -1)
+    right = np.array([1.0, 2.0, 3.0])[:, None] + np.array([1e-3, 0, 2e-3])[:, None] * still.t
+    assert np.allclose(away, right, rtol=1e-11)
+
+
+def test_round_off_is_a_random_walk():
+    """After 4e5 steps the energy is off by rounding alone, beside ε² dt² of the corrected method."""
+    system = HamiltonianSystem.planets([1.0, 1e-9, 1e-9], elements={"a": [1.0, 1.7], "e": [0.1, 0.2], "M": [0, 2.0]})
+    H = system.hamiltonian(
+        solve(system, "wisdom_holman", dt=0.15, t_span=(0, 60_000.0), save_every=1000, corrector=17).y.T
+    )
+    assert np.abs(H / H[0] - 1).max() < 3 * np.sqrt(4e5) * EPS
+
+
+@pytest.mark.filterwarnings("ignore:`system` has orbits that cross")
+def test_drifts_have_no_bias():
+    """Energies of planets alone change by no more than a random walk of half units in the last place does."""
+    orbits = {"a": 1 + 0.1 * np.arange(7), "e": 0.1, "M": 0.9 * np.arange(7), "inc": 0.1 * np.arange(7)}
+    system = HamiltonianSystem.planets([1.0, *[1e-30] * 7], elements=orbits, encounter=None)
+    n = 2_000_000
+    given = {"dt": 0.3, "t_span": (0, 0.3 * n), "save_every": n // 50, "compensated": True}
+    q, p = (x.reshape(8, 3, -1) for x in np.split(solve(system, "wisdom_holman", **given).y, 2))
+    x, v = (z[1:] - z[:1] for z in (q, p / system.local.masses[:, None, None]))
+    E = (v**2).sum(1) / 2 - 1 / np.sqrt((x**2).sum(1))
+    assert np.abs(E[:, -1] / E[:, 0] - 1).max() < 3 * np.sqrt(n) * EPS / 2
+
+
+@pytest.mark.filterwarnings("ignore:`dt` .* is long")
+def test_vectors_where_the_general_solver_takes_over():
+    system = HamiltonianSystem.planets([1.0, 1e-5, 1e-6], elements={"a": [1.0, 40.0], "e": [0.99, 0.9], "M": [3, 0.1]})
+    composition = sympflow.get("wisdom_holman")().composed(system)
+    for h in (0.1, 7.0, -30.0):
+        _, J = composition.tangent(system.y0, h)
+        scale = np.repeat(system.local.inertia, 3) ** 0.5
+        J = np.concatenate([scale, 1 / scale])[:, None] * J / np.concatenate([scale, 1 / scale])
+        M = np.kron([[0, 1], [-1, 0]], np.eye(9))
+        assert np.abs(J.T @ M @ J - M).max() < EPS * np.abs(J).max() ** 2 / (1 - 0.99)
+
+
+def test_a_lyapunov_time_is_found_where_planets_are_packed():
+    chaotic = HamiltonianSystem.planets(
+        [1.0, 1e-4, 1e-4], elements={"a": [1.0, 1.135], "e": 0.02, "M": [0.0, 2.0]}, encounter=None
+    )
+    rates = [lyapunov(s, "wisdom_holman", (0, 20_000.0), dt=0.2).value for s in (chaotic, MANY)]
+    assert rates[0] > 10 * rates[1]
+
+
+@pytest.mark.parametrize("mass", [1e-9, 0.0])
+def test_a_flattened_star_turns_the_node(mass):
+    """By −3/2 n J₂ (R/p)² cos i, of bodies with and without mass."""
+    J2, a, e, tilt = 1e-5, np.array([1.0, 2.0]), 0.1, 0.4
+    system = HamiltonianSystem.planets(
+        [1.0, 1e-9, mass],
+        elements={"a": a, "e": e, "inc": tilt, "M": [0.0, 2.0]},
+        extra="J2*G*m*R**2*(3*z**2/r**2 - 1)/(2*r**3)",
+        params={"J2": J2, "R": 0.5},
+    )
+    ends = [solve(system, m, (0, 4.0), dt=0.05).y[:, -1] for m in ("kepler_aba1064", "srkn11b")]
+    assert np.allclose(*ends, rtol=1e-8, atol=1e-10)
+    sol = solve(system, "wisdom_holman", (0, 120.0), dt=0.2)
+    node = np.unwrap(sympflow.elements(sol).node)
+    right = -1.5 * a**-1.5 * J2 * (0.5 / (a * (1 - e * e))) ** 2 * np.cos(tilt)
+    assert np.allclose([np.polyfit(sol.t, x, 1)[0] for x in node], right, rtol=0.03)
+
+
+@pytest.mark.filterwarnings("ignore:`dt` .* is long")
+def test_long_drifts_and_eccentric_orbits():
+    """The few corrections of the compiled drift do not suffice there: the general solver takes over, as on arrays."""
+    system = HamiltonianSystem.planets(
+        [1.0, 1e-5, 1e-6], elements={"a": [1.0, 40.0], "e": [0.99, 0.9], "M": [3.0, 0.1]}
+    )
+    for dt in (0.1, 2.0, 40.0, -3.0):
+        t = np.sign(dt) * np.abs(dt) * np.arange(3)
+        runs = [
+            solve(system, "wisdom_holman", (0, t[-1]), dt=abs(dt), t_eval=t, backend=b).y for b in ("auto", "array")
+        ]
+        assert np.abs(runs[0] - runs[1]).max() < 1e-10
+
+
+@pytest.mark.parametrize("coordinates", ["jacobi", "democratic"])
+@pytest.mark.parametrize("planets", [2, 8])
+def test_bodies_without_mass_are_compiled(planets, coordinates):
+    rng = np.random.default_rng(0)
+    a = np.concatenate([2.0 * 1.5 ** np.arange(planets), rng.uniform(1.0, 40.0, 30)])
+    orbits = {"a": a, "e": 0.02, "inc": rng.uniform(0, 0.1, len(a)), "M": rng.uniform(0, 6, len(a))}
+    given = {"coordinates": coordinates, "encounter": None, "extra": "1e-4/r**3"}
+    system = HamiltonianSystem.planets([1.0, *[1e-5] * planets, *[0.0] * 30], elements=orbits, **given)
+    runs = [solve(system, "wisdom_holman", (0, 12.0), dt=0.3, backend=b).y for b in ("compiled", "array")]
+    assert np.abs(runs[0] - runs[1]).max() < 1e-11
+    exact = solve(system, "dop853", (0, 12.0), t_eval=[12.0], rtol=1e-10, atol=1e-12).y[:, 0]
+    q = slice(system.ndof)
+    assert np.abs(runs[0][q, -1] - exact[q]).max() < 5e-5  # the extra potential moves them by 5e-3
+    few = {name: x if name == "e" else x[:planets] for name, x in orbits.items()}
+    alone = HamiltonianSystem.planets([1.0, *[1e-5] * planets], elements=few, **given)
+    d = 3 * (1 + planets)
+    assert np.abs(solve(alone, "wisdom_holman", (0, 12.0), dt=0.3).y[:d] - runs[0][:d]).max() < 1e-11
+
+
+@pytest.mark.parametrize("options", [{}, {"corrector": 11}])
+def test_windows_stores_and_dense_outputs(options, tmp_path):
+    given = {"method": "wisdom_holman", "t_span": (0, 40_000.0), "dt": 50.0, **options}
+    whole = solve(GIANTS, save_every=20, **given)
+    stored = solve(GIANTS, save_every=20, store=tmp_path / "half", **{**given, "t_span": (0, 20_000.0)})
+    assert np.array_equal(stored.y, whole.y[:, : stored.y.shape[1]])
+    stored = solve(GIANTS, save_every=20, store=tmp_path / "half", resume=True, **given)
+    assert np.array_equal(stored.y, whole.y)
+    dense = solve(GIANTS, save_every=20, dense_output=True, **given)
+    assert np.array_equal(dense.sol(whole.t), whole.y)

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from sympflow.schemes import SCHEMES
+from sympflow.schemes import SCHEMES, Scheme
 
 ALL = pytest.mark.parametrize("scheme", SCHEMES.values(), ids=SCHEMES.keys())
 
@@ -133,3 +133,10 @@ def test_evaluations_per_step():
         scheme = SCHEMES[name]
         assert scheme.first_same_as_last
         assert (scheme.force_evaluations, scheme.hessian_evaluations) == counts, name
+
+
+def test_order_conditions_see_a_coefficient_changed_in_the_tenth_digit():
+    good = SCHEMES["kahan_li8"]
+    kicks = (*good.kicks[:3], good.kicks[3] + 1e-10, *good.kicks[4:])
+    bad = Scheme("bad", 8, kicks, good.drifts, good.gradients, "")
+    assert order_defects(bad, 8).max() > 1e-11

@@ -1,5 +1,7 @@
 """torchdiffeq's solvers behind `solve`: the same numbers as torchdiffeq, and the contract of every method."""
 
+import re
+
 import numpy as np
 import pytest
 import torch
@@ -91,3 +93,38 @@ def test_a_batch_of_which_one_fails_keeps_the_dense_output_of_the_others():
 def test_methods_that_carry_a_slope_have_no_volume_to_measure():
     with pytest.raises(TypeError, match="not a one-step map"):
         volume_error(solve(HH, "adaptive_heun", (0, 1), rtol=1e-3, atol=1e-3))
+
+
+def test_gradients_flow_through_the_dense_output():
+    y0 = torch.tensor([1.0, 0.2], dtype=torch.float64)
+    for method in ("dopri5", "explicit_adams"):
+
+        def state(y, method=method):
+            return solve(PENDULUM, method, (0, 2), y, dense_output=True).sol(1.234)
+
+        exact = torch.autograd.functional.jacobian(
+            lambda y: solve(PENDULUM, "kahan_li8", (0, 2), y, t_eval=[1.234]).y[:, 0], y0
+        )
+        torch.testing.assert_close(torch.autograd.functional.jacobian(state, y0), exact, atol=1e-3, rtol=0)
+
+
+@pytest.mark.parametrize("y0", [HH.y0, np.stack([HH.y0, 0.5 * HH.y0])], ids=["single", "batch"])
+def test_a_run_of_too_many_steps_ends_with_what_it_has(y0):
+    t = np.linspace(0, 6, 41)
+    sol = solve(HH, "bosh3", (0, 6), y0, t_eval=t, max_num_steps=100, dense_output=True)
+    assert np.all(sol.status == -1)
+    assert re.match(
+        r"After `max_num_steps` = 100 steps t = [\d.]+ is reached, and at this pace the end needs about [\de+.]+ "
+        r"more\. Raise `max_num_steps` or the tolerances, or end `t_span` earlier\.",
+        sol.message,
+    )
+    whole = solve(HH, "bosh3", (0, 6), y0, t_eval=t, max_num_steps=5000)
+    reached = np.max(sol.stats["failed_at"])
+    done = np.count_nonzero(t <= reached)
+    assert 1 < done < len(t)
+    np.testing.assert_array_equal(sol.y[..., :done], whole.y[..., :done])
+    assert np.isnan(sol.y[..., done:]).all()
+    assert sol.y.shape[-1] == (done if y0.ndim == 1 else len(t))
+    np.testing.assert_allclose(sol.sol(t[done - 1]), whole.y[..., done - 1], rtol=0, atol=256 * EPS)
+    with pytest.raises(ValueError, match=r"^`max_num_steps` must be a positive integer"):
+        get("bosh3")(max_num_steps=True)

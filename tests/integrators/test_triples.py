@@ -1,9 +1,13 @@
 """A method is a scheme × a splitting × a clock: the rows of the table, and triples that a user writes himself."""
 
+import gc
+import weakref
+
 import numpy as np
 import pytest
 
 from sympflow import compare, get, solve, systems
+from sympflow.schemes import SCHEMES
 
 FPUT, PENDULUM, KEPLER = systems.fput(m=2, omega=20.0), systems.spring_pendulum(), systems.kepler(0.3)
 
@@ -66,3 +70,21 @@ def test_what_a_subclass_overrides_is_asked(name):
     assert calls == ["rollout"]
     assert watched.stats["force_evaluations"] == 7
     assert watched.stats["backend"] == plain.stats["backend"] == "compiled"
+
+
+def test_strang_steps_are_what_parts_compose():
+    with pytest.raises(ValueError, match=r"^`splitting` 'parts' composes Strang steps, .* 'blanes_moan4' is not made"):
+        solve(PENDULUM, "blanes_moan4", (0, 1), splitting="parts")
+    for name in ("verlet", "leapfrog", "suzuki4", "kahan_li6", "kahan_li8", "yoshida4"):
+        assert sum(SCHEMES[name].strang_weights) == pytest.approx(1.0, abs=1e-14)
+    assert SCHEMES["srkn11b"].strang_weights is None
+
+
+@pytest.mark.parametrize("name", ["verlet", "linear_srkn6b", "strang_parts", "log_leapfrog"])
+def test_no_method_keeps_a_system_alive(name):
+    system = systems.kepler(0.3) if name == "log_leapfrog" else systems.fput(m=1, omega=10.0)
+    solve(system, name, (0, 0.3), t_eval=[0.3])
+    alive = weakref.ref(system)
+    del system
+    gc.collect()
+    assert alive() is None

@@ -1,6 +1,7 @@
 """Derivatives and transforms of torch through `odeint`, `solve` and flows: right, or refused, never silently zero."""
 
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from torch.autograd.functional import jacobian
 from torch.func import grad, hessian, jacfwd, jacrev, jvp, vjp, vmap
 
 from sympflow import HamiltonianSystem, MLPFlow, SympFlow, get, solve, systems
-from sympflow.interop.torchdiffeq import odeint, odeint_event
+from sympflow.interop.torchdiffeq import odeint, odeint_dense, odeint_event
 
 PENDULUM, OSCILLATOR = systems.pendulum(), systems.harmonic_oscillator()
 KINDS = ["verlet", "kahan_li8", "chin4a", "gauss_legendre4", "strang_parts", "mollified_impulse", "sympflow", "mlp"]
@@ -132,6 +133,23 @@ class TestNumbersOfH:
         differences = (end(mass + small) - end(mass - small)) / (2 * small)
         torch.testing.assert_close(derivative(end)(mass), differences, rtol=0, atol=1e-8)
 
+    def test_of_dense_output_and_event_times(self):
+        def within(k):
+            return odeint_dense(self.system(k), self.y0, 0.0, 0.7, method="verlet", options={"dt": 0.1})(T[1])
+
+        def crossing(k):
+            return odeint_event(self.system(k), self.y0, T[0], event_fn=lambda t, y: y[0] - 0.3, method="verlet")[0]
+
+        k = torch.tensor(1.3, dtype=torch.float64)
+        for f in (within, crossing):
+            J = jacobian(f, k)
+            assert J.abs().min() > 0.01
+            torch.testing.assert_close(jacfwd(f)(k), J, rtol=0, atol=1e-9)
+            torch.testing.assert_close(jacrev(f)(k), J, rtol=0, atol=1e-9)
+            torch.testing.assert_close(tangent_along_ones(f, k), J, rtol=0, atol=1e-9)
+        with pytest.raises(TypeError, match=r"^`event_fn` is followed by the values.*torch\.func\.vmap"):
+            vmap(crossing)(k[None])
+
 
 class TestEvents:
     def event(self, y, method="verlet"):
@@ -144,6 +162,17 @@ class TestEvents:
             torch.testing.assert_close(jacfwd(part)(Y[0]), J, rtol=0, atol=1e-9)
             torch.testing.assert_close(jacrev(part)(Y[0]), J, rtol=0, atol=1e-9)
             torch.testing.assert_close(tangent_along_ones(part, Y[0]), J.sum(-1), rtol=0, atol=1e-9)
+
+    def test_second_derivatives(self):
+        """The derivatives of a derivative: a Newton step with a fixed slope alone would make them wrong."""
+        y = Y[0].clone().requires_grad_(True)
+        assert torch.autograd.gradgradcheck(lambda y: self.event(y)[0], (y,))
+        torch.testing.assert_close(
+            hessian(lambda y: self.event(y)[0])(Y[0]),
+            torch.autograd.functional.hessian(lambda y: self.event(y)[0], Y[0]),
+            rtol=0,
+            atol=1e-9,
+        )
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")  # Dynamo's own, of code that it traces
@@ -164,6 +193,15 @@ class TestCompiled:
         f = problem("verlet")[which]
         with pytest.raises(Exception, match=r"looks at values, which torch\.compile hides: compile the steps"):
             torch.compile(f, backend="eager", fullgraph=True)(Y[0])
+
+    def test_flows(self):
+        torch.compiler.reset()
+        psi = SympFlow(1, hidden=(5,), dt=0.5)
+        expected = psi(1.2, Y)
+        compiled = torch.compile(lambda y: psi(1.2, y), backend="eager", fullgraph=True)
+        torch.testing.assert_close(compiled(Y), expected, **CLOSE)
+        compiled = torch.compile(psi.psi, backend="eager", fullgraph=True)
+        torch.testing.assert_close(compiled(T[1], Y), psi(0.25, Y), **CLOSE)
 
 
 class TestRefusals:
@@ -259,3 +297,27 @@ def test_the_state_at_a_terminal_event_of_solve_says_that_it_has_no_derivative()
     with pytest.warns(UserWarning, match="carries no derivative.*odeint_event"):
         solve(PENDULUM, "verlet", (0.0, 5.0), Y[0].clone().requires_grad_(True), events=crossing)
     assert solve(PENDULUM, "verlet", (0.0, 5.0), Y[0], events=crossing).status == 1
+
+
+DOCUMENTED = {
+    "`backward`, `torch.autograd.grad`": ["backward"],
+    "dual tensors, `torch.autograd.forward_ad`": ["dual tensors"],
+    "`torch.autograd.functional.jacobian`, both strategies": ["jacobian, forward mode", "jacobian, vectorized"],
+    "`torch.func.grad`, `vjp`, `jacrev`": ["grad", "vjp", "jacrev"],
+    "`torch.func.jvp`, `jacfwd`": ["jvp", "jacfwd"],
+    "`torch.func.hessian`": ["TestEveryTransform.test_derivatives_in_y0"],
+    "`torch.func.vmap`, of these too": ["TestEveryTransform.test_vmap"],
+    "`torch.func.functional_call`": ["TestFlows.test_functional_weights"],
+    "`torch.compile(fullgraph=True)`": ["TestCompiled.test_steps", "TestCompiled.test_whole_runs_are_refused"],
+}
+
+
+def test_every_row_of_the_documented_table_is_executed():
+    page = (Path(__file__).parents[2] / "docs" / "plugins-and-interop.md").read_text(encoding="utf-8")
+    table = page.partition("| transform |")[2].partition("\n\n")[0]
+    rows = [line.split("|")[1].strip() for line in table.splitlines()[2:]]
+    assert rows == list(DOCUMENTED)
+    for names in DOCUMENTED.values():
+        for name in names:
+            cls, _, test = name.partition(".")
+            assert name in DERIVATIVES or callable(getattr(globals()[cls], test))

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.integrate import solve_ivp
+from scipy.interpolate import CubicSpline
 
 from sympflow import HamiltonianSystem, SympFlow, solve
 from sympflow.interop import torchdiffeq as ours
@@ -94,3 +95,25 @@ def test_another_drive_is_refused_whoever_asks():
     t = torch.tensor([0.0, 3.0], dtype=torch.float64)
     with pytest.raises(ValueError, match="`func` is not the system that method 'verlet' solves"):
         ours.odeint(as_function(OTHER), Y, t, method="verlet", options={"system": DRIVEN})
+
+
+SAMPLED = HamiltonianSystem.from_sympy(
+    "p**2/2 - a*cos(q)", time="t", params={"a": CubicSpline([0, 1, 2, 3], [1, 2, 1, 3])}, y0=[1, 0.2], dt=0.1
+)
+
+
+def test_torchode_has_a_time_for_each_sample():
+    torchode = pytest.importorskip("torchode", reason="torchode is an optional peer: pip install torchode")
+    from sympflow.interop.torchode import register
+
+    register("driven_verlet", DRIVEN, "verlet")
+    t = torch.tensor([[0.0, 0.55, 2.0], [1.0, 1.3, 3.21]], dtype=torch.float64)
+    arguments = {"method": "driven_verlet", "controller": torchode.FixedStepController()}
+    dt0 = torch.full((2,), 0.1, dtype=torch.float64)
+    found = torchode.solve_ivp(DRIVEN, Y.expand(2, 2), t, dt0=dt0, **arguments).ys
+    for states, times in zip(found, t.numpy(), strict=True):
+        sol = solve(DRIVEN, "verlet", (times[0], times[-1]), t_eval=times)
+        np.testing.assert_allclose(states.T, sol.y, **CLOSE)
+    register("sampled_verlet", SAMPLED, "verlet")
+    with pytest.raises(ValueError, match="leaves the samples"):
+        torchode.solve_ivp(SAMPLED, Y[None], t[1:], dt0=dt0[1:], **{**arguments, "method": "sampled_verlet"})

@@ -78,6 +78,16 @@ class TestEveryKind:
                 np.testing.assert_allclose(theirs.t_events[i], ours.t_events[i], rtol=1e-10)
                 np.testing.assert_allclose(theirs.y_events[i], ours.y_events[i], atol=1e-9)
 
+    def test_max_step_samples_the_same_run(self, method):
+        coarse = solve_ivp(HH, (0, 3), HH.y0, method=solver(method))
+        fine = solve_ivp(HH, (0, 3), HH.y0, method=solver(method), max_step=0.04, dense_output=True)
+        n = round((len(fine.t) - 1) / (len(coarse.t) - 1))
+        assert n == np.ceil(np.diff(coarse.t)[0] / 0.04 - 1e-9)
+        np.testing.assert_allclose(fine.y[:, ::n], coarse.y, atol=200 * EPS)
+        np.testing.assert_allclose(fine.sol(fine.t), fine.y, atol=200 * EPS)
+        none = solve_ivp(HH, (2, 2), HH.y0, method=solver(method), dense_output=True)
+        np.testing.assert_array_equal([none.y[:, -1], none.sol(2.0)], [HH.y0, HH.y0])
+
 
 @pytest.fixture
 def counting():
@@ -144,6 +154,16 @@ class TestAnotherSystem:
 
         with pytest.raises(ValueError, match=r"^`fun` is not the system that method 'verlet' solves: at t = \d"):
             solve_ivp(fun, (0, 60), [0.0, 1.9], method=as_scipy("verlet", PENDULUM))
+
+    @pytest.mark.parametrize("strength", [lambda t: 0.01 * t, np.sin, lambda t: 31 < t < 36, lambda t: t > 99.6])
+    def test_that_depends_on_the_time(self, strength):
+        """It agrees at t0: what changes later, for a while or at the end, is seen."""
+
+        def fun(t, y):
+            return [y[1], -np.sin(y[0]) * (1 + strength(t))]
+
+        with pytest.raises(ValueError, match=r"^`fun` depends on the time: .* method 'verlet' solves an autonomous"):
+            solve_ivp(fun, (0, 100), [0.0, 1.9], method=as_scipy("verlet", PENDULUM))
 
 
 def test_a_flow_and_a_name_without_system():
@@ -231,3 +251,9 @@ def test_solutions_and_solvers_are_pickled_and_copied():
         each.step()
     np.testing.assert_allclose(solver.y, [np.cos(0.6), -np.sin(0.6)], atol=1e-8)
     np.testing.assert_allclose(twin.y, [np.cos(0.9), -np.sin(0.9)], atol=1e-8)
+
+
+def test_two_events_within_a_step_are_seen_with_max_step(rotation):
+    arguments = {"events": lambda t, y: (t - 0.2) * (t - 0.8), "method": as_scipy(rotation)}
+    assert solve_ivp(OSCILLATOR, (0, 2), [1.0, 0.0], **arguments).t_events[0].size == 0
+    assert solve_ivp(OSCILLATOR, (0, 2), [1.0, 0.0], max_step=0.3, **arguments).t_events[0].size == 2

@@ -196,3 +196,27 @@ test_refusals = refusals(
         "^`H` .*with torch functions; .* gave a NumPy array",
     ),
 )
+
+
+@pytest.mark.parametrize("e", [1e-9, 1.0, 7e8])
+def test_the_units_of_a_module_do_not_matter(e):
+    def with_coupling(c, d):
+        return lambda t, y: torch.stack([y[..., 1] / e + c * y[..., 0], -e * y[..., 0] - d * y[..., 1]], -1)
+
+    assert from_module(with_coupling(0.0, 0.0), 1, y0=[1.0, e]).separable
+    assert not from_module(with_coupling(0.3, 0.3), 1, y0=[1.0, e]).separable
+    with pytest.raises(ValueError, match=r"^`module` is not a Hamiltonian field"):
+        from_module(with_coupling(0.3, 0.2), 1, y0=[1.0, e])
+
+
+def test_masses_of_very_different_size():
+    system = from_hamiltonian(lambda q, p: p[..., 0] ** 2 / 2 + p[..., 1] ** 2 / 2e9 + (q**4).sum(-1), 2)
+    assert system.separable
+    np.testing.assert_array_equal(system.vector_field(np.array([0.0, 0.0, 3.0, 3e9]))[:2], [3.0, 3.0])
+    free = from_hamiltonian(lambda q, p: (p**2).sum(-1) / 6e4, 2)
+    np.testing.assert_array_equal(free.vector_field(np.array([0.0, 0.0, 3e4, 6e4]))[:2], [1.0, 2.0])
+
+
+def test_a_field_that_changes_late_is_not_autonomous():
+    with pytest.raises(ValueError, match=r"^`module` depends on t"):
+        from_module(lambda t, y: Field()(t, y) * (1.0 if t < 5 else 2.0), 2, y0=HH.y0)

@@ -1,5 +1,7 @@
 """Our methods inside torchdiffeq's `odeint` and `odeint_event`: the numbers of `solve`, and exact gradients."""
 
+import gc
+import weakref
 from importlib import import_module
 
 import numpy as np
@@ -89,6 +91,65 @@ class TestEvents:
         torch.testing.assert_close(ours[0], theirs[0], rtol=0, atol=1e-8)
         torch.testing.assert_close(ours[1], theirs[1], rtol=0, atol=1e-8)
 
+    @pytest.mark.parametrize("reverse", [False, True])
+    @pytest.mark.parametrize("method", ["verlet", "rotation"])
+    def test_the_first_zero(self, method, reverse, rotation):
+        method = rotation if method == "rotation" else method
+        t, y = odeint_event(
+            OSCILLATOR, times(1.0, 0.0), times(0.3)[0], event_fn=lambda t, y: y[0], reverse_time=reverse, method=method
+        )
+        expected = 0.3 + (-1 if reverse else 1) * np.pi / 2
+        assert float(t) == pytest.approx(expected, abs=1e-3 if method == "verlet" else 1e-13)
+        assert y.shape == (2, 2)
+        assert abs(float(y[1, 0])) < 1e-14
+
+    @pytest.mark.parametrize("reverse", [False, True])
+    def test_the_first_of_two_zeros_within_a_step_is_seen(self, rotation, reverse):
+        """q grows from cos 0.45 to 1 and falls again: it passes 0.95 twice within Δt = 1."""
+        y0 = times(np.cos(0.45), (-1 if reverse else 1) * np.sin(0.45)).repeat(2, 1)
+        t, y = odeint_event(
+            OSCILLATOR,
+            y0,
+            times(0.0)[0],
+            event_fn=lambda t, y: 0.95 - y[..., 0].mean(),
+            reverse_time=reverse,
+            method=rotation,
+        )
+        assert abs(float(t)) == pytest.approx(0.45 - np.arccos(0.95), abs=1e-13)
+        torch.testing.assert_close(y[1, :, 0], times(0.95, 0.95))
+
+    @pytest.mark.parametrize("reverse", [False, True])
+    @pytest.mark.slow
+    def test_gradients_of_time_and_state(self, reverse):
+        y0 = times(1.0, 0.2).requires_grad_(True)
+        t0 = times(0.1)[0].requires_grad_(True)
+        psi = flow(seed=3)
+
+        def of_verlet(y, t):
+            return odeint_event(
+                PENDULUM, y, t, event_fn=lambda t, y: y[0] - 0.3 + 0.1 * t, reverse_time=reverse, method="verlet"
+            )
+
+        def of_flow(y, t, *weights):
+            return odeint_event(PENDULUM, y, t, event_fn=lambda t, y: y[1] - 0.21, method=psi)
+
+        assert torch.autograd.gradcheck(of_verlet, (y0, t0))
+        crossed = odeint_event(PENDULUM, y0, t0, event_fn=lambda t, y: t - 0.83, method=psi)
+        assert float(crossed[0].detach()) == pytest.approx(0.83)
+        end = torch.autograd.gradcheck(
+            lambda y, *w: odeint_event(PENDULUM, y, t0.detach(), event_fn=lambda t, y: t + y[0] - 1.9, method=psi),
+            (y0, *psi.parameters()),
+        )
+        assert end
+
+    @pytest.mark.parametrize("unit", [1e-170, 1e-300, 1e300])
+    def test_the_unit_of_the_event_function_does_not_matter(self, unit):
+        found = [
+            odeint_event(HH, torch.tensor(HH.y0), times(0.0)[0], event_fn=lambda t, y, c=c: y[0] * c, method="verlet")
+            for c in (1.0, unit)
+        ]
+        torch.testing.assert_close(found[0][0], found[1][0], rtol=1e-14, atol=0.0)
+
 
 class TestAdjoint:
     """Gradients by stepping back: those of backpropagation, in memory that does not grow with the steps."""
@@ -139,6 +200,32 @@ class TestAdjoint:
         )
         with pytest.raises(RuntimeError, match="once_differentiable"):
             slope.sum().backward()
+
+    def test_memory_does_not_grow_with_the_steps(self):
+        """The most that autograd keeps at a time, forward and backward."""
+
+        def most_kept(run, n):
+            live, most = 0, 0
+
+            class Kept:
+                def __init__(self, x):
+                    nonlocal live, most
+                    self.x = x
+                    live += x.numel()
+                    most = max(most, live)
+
+                def __del__(self):
+                    nonlocal live
+                    live -= self.x.numel()
+
+            y0 = torch.tensor(HH.y0, requires_grad=True)
+            with torch.autograd.graph.saved_tensors_hooks(Kept, lambda kept: kept.x):
+                odeint_end = run(HH, y0, times(0.0, 0.05 * n), method="strang_parts", options={"dt": 0.05})[-1]
+                odeint_end.sum().backward()
+            return most
+
+        assert most_kept(odeint_adjoint, 400) == most_kept(odeint_adjoint, 40)
+        assert most_kept(odeint, 400) > 9 * most_kept(odeint, 40)
 
 
 class TestDense:
@@ -193,6 +280,15 @@ class TestCallbacks:
             called[method] = np.array(seen)
             assert len(run) == (2 if as_tuple else len(t))
         np.testing.assert_allclose(called["verlet"], called["rk4"], atol=1e-12)
+
+    def test_states_and_gradients_are_those_of_the_run(self):
+        system, seen = systems.pendulum(), []
+        system.callback_step = lambda t0, y, dt: seen.append(y)
+        y0 = times(1.0, 0.2).requires_grad_(True)
+        y = odeint(system, y0, times(0.0, 0.1, 0.2, 0.3), method="verlet", options={"dt": 0.1})
+        torch.testing.assert_close(torch.stack(seen), y[:-1], rtol=0, atol=0)
+        plain = odeint(PENDULUM, y0, times(0.0, 0.1, 0.2, 0.3), method="verlet", options={"dt": 0.1})
+        torch.testing.assert_close(y, plain, rtol=0, atol=1e-15)  # which is compiled
 
 
 class TestRegistration:
@@ -271,6 +367,22 @@ class TestRemembered:
         func.k = 1.01
         with pytest.raises(ValueError, match=r"^`func` is not the system"):
             func.run()
+
+    def test_what_was_refused_is_not_remembered(self):
+        func = Counted()
+        func.k = 1.01
+        with pytest.raises(ValueError, match=r"^`func` is not the system"):
+            func.run()
+        func.k = 1.0
+        assert func.run() > 15
+
+    def test_nothing_is_kept_alive(self):
+        func, system = Counted(), systems.pendulum()
+        func.run(system=system)
+        kept = weakref.ref(func), weakref.ref(system)
+        del func, system
+        gc.collect()
+        assert [reference() for reference in kept] == [None, None]
 
 
 class TestAnotherSystem:
@@ -375,3 +487,24 @@ def test_everything_else_is_handed_on():
     module = torch.nn.Linear(4, 4).double()
     theirs = torchdiffeq.odeint_adjoint(lambda t, y: module(y), y0, t, adjoint_params=())
     assert torch.equal(odeint_adjoint(lambda t, y: module(y), y0, t, adjoint_params=()), theirs)
+
+
+@pytest.mark.parametrize("t", [(0.0, 0.25, 1.2), (0.2, -0.13, -1.4)])
+def test_gradients_of_a_flow_to_y0_t_and_weights(t):
+    psi = SympFlow(1, hidden=(2,), dt=0.5)
+    y0 = torch.tensor([[1.0, 0.2], [0.3, -0.4]], dtype=torch.float64, requires_grad=True)
+
+    def states(y, s, *weights):
+        return odeint(PENDULUM, y, s, method="sympflow", options={"flow": psi})
+
+    assert torch.autograd.gradcheck(states, (y0, times(*t).requires_grad_(True), *psi.parameters()))
+
+
+def test_gradient_in_t_on_the_grid_is_the_velocity(rotation):
+    t = times(0.0, 0.5, 2.0).requires_grad_(True)
+    y = odeint(OSCILLATOR, times(1.0, 0.0), t, method=rotation)
+    slope = torch.autograd.functional.jacobian(
+        lambda s: odeint(OSCILLATOR, times(1.0, 0.0), s, method=rotation)[2, 0], t.detach()
+    )
+    torch.testing.assert_close(slope[2], y[2, 1].detach())  # dq/dt = p
+    torch.testing.assert_close(slope[0], -y[2, 1].detach())

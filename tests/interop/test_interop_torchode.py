@@ -99,3 +99,25 @@ def test_bad_arguments_are_named():
         run(step_method(flow, HH), y0, t_eval, 2.0)
     with pytest.raises(ValueError, match=r"^`y0` must have shape \(batch, 4\)"):
         run(step_method("verlet", HH), y0[:, :2], t_eval, 0.1)
+
+
+def test_backward_time():
+    register("verlet", HH)
+    y0 = torch.tensor(HH.domain.sample(2, 0))
+    sol = run("verlet", y0, torch.tensor([[2.0, 1.0, 0.05], [0.0, -0.3, -1.0]], dtype=torch.float64), -0.1)
+    ours = solve(HH, "verlet", (2.0, 0.05), y0=y0[0].numpy(), t_eval=[2.0, 1.0, 0.05], dt=0.1)
+    np.testing.assert_allclose(sol.ys[0].numpy(), ours.y.T, atol=200 * EPS)
+
+
+def test_gradients_to_y0_t_and_weights():
+    flow = SympFlow(1, hidden=(2,), dt=0.5)
+    y0 = torch.tensor([[1.0, 0.2], [0.3, -0.4]], dtype=torch.float64, requires_grad=True)
+    t = torch.tensor([[0.0, 0.3, 0.83], [0.1, 0.45, 1.33]], dtype=torch.float64, requires_grad=True)
+    for method in (step_method("verlet", PENDULUM), step_method(flow, PENDULUM)):
+        weights = tuple(method.parameters())
+        assert bool(weights) == (method.flow is not None)
+
+        def states(y, t, *w, method=method):
+            return run(method, y, t, 0.4).ys
+
+        assert torch.autograd.gradcheck(states, (y0, t, *weights))

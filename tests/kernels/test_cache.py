@@ -80,3 +80,13 @@ def test_a_fresh_process_finds_the_machine_code_and_makes_what_is_damaged_again(
 def test_a_folder_that_cannot_be_written_is_no_obstacle(tmp_path):
     (tmp_path / "file").write_text("not a folder")
     assert told(tmp_path / "file" / "cache", SCRIPT).startswith("[[")
+
+
+@pytest.mark.slow
+def test_processes_that_compile_at_once(tmp_path):
+    """Each finds or makes the same file, and none reads what another one is about to write."""
+    processes = [started(tmp_path, SCRIPT) for _ in range(4)]
+    first, *others = [process.communicate()[0] for process in processes]
+    assert first.startswith("[[")
+    assert others == [first] * 3
+    assert [file.suffix for file in (tmp_path / "code").iterdir()] == [".o"]

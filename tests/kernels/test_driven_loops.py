@@ -3,11 +3,12 @@
 import math
 from functools import cache
 
+import numba
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from sympflow import HamiltonianSystem, get
+from sympflow import HamiltonianSystem, get, solve
 from sympflow.kernels.splitting_loops import splitting_loops
 from sympflow.schemes import SCHEMES
 
@@ -53,3 +54,17 @@ def test_a_step_has_its_inverse_and_its_jacobian_at_its_time(method):
     assert np.abs(A - np.stack(slopes, -1)).max() < 1e-8
     assert np.abs(found - end).max() < 1e-14
     assert np.abs(np.linalg.det(A) - 1).max() < 1e-13
+
+
+def test_numba_functions_with_the_time_first():
+    @numba.njit
+    def potential(t, q):
+        return -np.cos(q[0]) * (1 + 0.3 * np.cos(W * t))
+
+    @numba.njit
+    def gradient(t, q, out):
+        out[0] = np.sin(q[0]) * (1 + 0.3 * np.cos(W * t))
+
+    system = HamiltonianSystem(potential, ndof=1, gradient=gradient, time=True)
+    found = solve(system, "kahan_li8", t_span=(T0, T0 + 4), y0=START, dt=0.1, backend="compiled")
+    assert np.abs(found.y[:, -1] - exact(PENDULUM)).max() < 1e-11

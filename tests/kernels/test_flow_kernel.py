@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 import torch
 
+from sympflow.flow.layers import Drift, Kick
+from sympflow.flow.potentials import MLPPotential
 from sympflow.flow.scaling import Scaling
 from sympflow.flow.sympflow import SympFlow
 
@@ -79,3 +81,50 @@ def test_states_that_are_not_finite(flow):
     assert (n_finite[~harmed] == 4).all()
     fine = ~harmed & (np.arange(40) != 8)
     assert step_errors(flow, 0.8, Y[fine].swapaxes(0, 1)).max() < ROUNDING
+
+
+def torch_steps(flow, h, y0, n_steps):
+    """Every state of a run, by torch: (n_steps + 1, ..., 2d)."""
+    y = [torch.as_tensor(y0)]
+    with torch.no_grad():
+        for _ in range(n_steps):
+            y.append(flow(h, y[-1]))
+    return torch.stack(y).numpy()
+
+
+@pytest.mark.parametrize(("hidden", "activation"), [((4, 7, 3), "logcosh"), ((20, 18), "sin")])
+def test_any_depth_and_widths(hidden, activation):
+    flow = lively(SympFlow(2, pairs=1, hidden=hidden, activation=activation))
+    y0 = states(3, 2)
+    Y, *_ = flow.kernel_for(None).run(1.0, y0, 2, np.array([2]))
+    assert np.abs(Y[:, 0] - torch_steps(flow, 1.0, y0, 2)[-1]).max() < ROUNDING
+    single, *_ = flow.kernel_for(None).run(1.0, y0[0], 2, np.array([2]))
+    assert np.array_equal(single[0], Y[0, 0])
+    rows, *_ = flow.kernel_for(None).run(1.0, states(40, 2), 2, np.array([2]))
+    assert np.array_equal(rows[:3, 0], Y[:, 0])  # features or trajectories in lanes
+
+
+def test_layers_in_any_order():
+    generator = torch.Generator().manual_seed(3)
+
+    def potential(width):
+        return MLPPotential(2, (width, width), generator=generator)
+
+    flow = SympFlow.from_layers(
+        [Drift(potential(6)), Kick(potential(10)), Kick(potential(3)), Drift(potential(6))], dt=1
+    )
+    y0 = states(1, 2)[0]
+    Y, *_ = flow.kernel_for(None).run(-0.7, y0, 3, np.array([3]))
+    assert np.abs(Y[0] - torch_steps(flow, -0.7, y0, 3)[-1]).max() < ROUNDING
+
+
+def test_new_weights_are_noticed():
+    flow = SympFlow(1, pairs=1)
+    y = states(2, 1)
+    before, kernel = flow.kernel_for(None).step(1.0, y).states, flow.kernel_for(None)
+    assert flow.kernel_for(None) is kernel
+    flow.layers[0].potential.weight_x.data.mul_(2)  # which leaves no trace in torch's version counter
+    after = flow.kernel_for(None).step(1.0, y).states
+    assert np.abs(after - before).max() > 1e-3
+    flow.load_state_dict({k: 2 * v for k, v in flow.state_dict().items()}, assign=True)
+    assert np.abs(flow.kernel_for(None).step(1.0, y).states - torch_steps(flow, 1.0, y, 1)[1]).max() < ROUNDING

@@ -5,7 +5,9 @@ import pytest
 from conftest import FULL_MASS_MATRIX, RELATIVISTIC
 from numba import njit
 
+from sympflow.compiler.machine import compiled
 from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.kernels.protocol import RunCheckpoint
 from sympflow.kernels.splitting_loops import splitting_loops
 from sympflow.schemes import SCHEMES, Scheme
 from sympflow.systems import henon_heiles
@@ -175,3 +177,63 @@ def test_a_lane_that_overflows_leaves_the_others_unharmed(runaway):
 def test_refusals(system, message):
     with pytest.raises(ValueError, match=message):
         splitting_loops(system()).kernel(SCHEMES["chin4a"])
+
+
+@pytest.mark.parametrize("scheme", [VERLET, SCHEMES["leapfrog"], EULER], ids=lambda s: s.name)
+@pytest.mark.parametrize("save", [[], [0], [0, 0, 5, 5], [1, 2, 3, 700], [999], [1000], [0, 255, 256, 257, 512]])
+def test_saving_never_changes_the_trajectory(systems, scheme, save):
+    system = systems["henon_heiles"]
+    loops, save = splitting_loops(system), np.array(save, dtype=np.int64)
+    every, *_ = loops.kernel(scheme).run(0.1, system.y0, 1000, np.arange(1001))
+    some, n_finite, _ = loops.kernel(scheme).run(0.1, system.y0, 1000, save)
+    assert n_finite == 1000
+    assert np.array_equal(some, every[save])
+
+
+def test_runs_without_outputs_or_steps_reach_their_end(systems):
+    kernel, y0, carry = splitting_loops(systems["henon_heiles"]).kernel(VERLET), np.full((37, 4), 0.1), RunCheckpoint()
+    run = kernel.run(0.1, y0, 50, np.zeros(0, int), carry)
+    assert (run.n_finite == 50).all()
+    assert np.isfinite(carry.running).all()
+    Y, n_finite, _ = kernel.run(0.1, y0, 0, np.array([0]))
+    assert np.array_equal(Y, y0[:, None])
+    assert not n_finite.any()
+
+
+PARAMETERS = {"m": 1.5, "M": 0.7, "w": 1.3, "lam": 0.9}, {"m": 0.8, "M": 2, "w": 0.9, "lam": -0.4}
+
+
+@pytest.fixture
+def texts(monkeypatch):
+    """The texts that functions are made of, as they are asked for."""
+    found = []
+
+    def spy(text, *rest):
+        found.append(text)
+        return compiled(text, *rest)
+
+    monkeypatch.setattr("sympflow.kernels.runs.compiled", spy)
+    monkeypatch.setattr("sympflow.kernels.rollouts._CODES", {})
+    return found
+
+
+def with_parameters(**params):
+    text = "p1**2/(2*m) + p2**2/(2*M) + w**2*(q1**2 + q2**2)/2 + lam*(q1**n*q2 - q2**3/3)"
+    return HamiltonianSystem.from_sympy(text, params={"n": 2, **params}, y0=[0.1, 0.2, 0.3, -0.1])
+
+
+@pytest.mark.parametrize("compensated", [False, True])
+def test_other_values_of_parameters_need_no_other_code(texts, compensated):
+    for i, params in enumerate(PARAMETERS):
+        system = with_parameters(**params)
+        kernel, save = splitting_loops(system).kernel(VERLET, compensated), np.array([0, 3, 40])
+        y0 = system.y0 + 0.01 * np.arange(9)[:, None]
+        found = kernel.run(0.1, y0[1], 40, save).states, kernel.run(0.1, y0, 40, save).states
+        step = kernel.step(np.linspace(0.05, 0.1, 9), y0).states if not compensated else None
+        assert bool(texts) == (i == 0)
+        texts.clear()
+        expected = plain_run(system, VERLET, 0.1, y0, 40).swapaxes(0, 1)[:, save]
+        assert np.abs(found[0] - expected[1]).max() < 2e-14
+        assert np.abs(found[1] - expected).max() < 2e-14
+        if step is not None:
+            assert np.abs(step[-1] - plain_run(system, VERLET, 0.1, y0[-1], 1)[-1]).max() < 2e-15

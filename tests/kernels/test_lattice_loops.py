@@ -7,7 +7,9 @@ import pytest
 
 from sympflow import HamiltonianSystem, solve
 from sympflow.kernels import lattices
+from sympflow.kernels.protocol import RunCheckpoint
 from sympflow.kernels.splitting_loops import splitting_loops
+from sympflow.kernels.stages import single_table
 from sympflow.kernels.threads import at_most
 from sympflow.schemes import SCHEMES
 
@@ -151,3 +153,44 @@ def test_compensated_sums_lower_the_rounding(shape):
         back = solve(system, "srkn6b", t_span=(100.0, 0), y0=end, t_eval=[0.0], **how).y[:, -1]
         left.append(np.abs(back - y0).max())
     assert left[1] < left[0] / 5
+
+
+def test_widths_change_nothing(monkeypatch):
+    system, runs = chain(48), []
+    for width in (1, 2, 4, 8):
+        monkeypatch.setattr(lattices, "arrangement", lambda lattice, width=width: ([0], width))
+        code = lattices.LatticeCode(system.local, False, SCHEMES["chin4c"].level, False)
+        runs.append(np.empty((1, 96)))
+        code.mapped(single_table(SCHEMES["chin4c"], 0.1).packed, start(system, 1), runs[-1])
+        np.testing.assert_array_equal(runs[-1], runs[0])
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_a_run_that_becomes_infinite_keeps_what_it_has(threads, pieces):
+    system = ring(230)
+    y0 = start(system)
+    y0[7] = 60.0
+    with at_most(threads):
+        loops, arrays = (
+            solve(system, "srkn6b", t_span=(0.0, 10.0), y0=y0, dt=0.2, backend=backend)
+            for backend in ("compiled", "array")
+        )
+    assert loops.status == arrays.status == -1
+    np.testing.assert_array_equal(loops.t, arrays.t)
+
+
+@pytest.mark.parametrize("compensated", [False, True])
+def test_a_run_in_pieces_has_the_bits_of_one(compensated, pieces):
+    system = ring(230)
+    y0, kernel = start(system), splitting_loops(system).kernel(SCHEMES["srkn6b"], compensated)
+    for threads in (1, 2):
+        with at_most(threads):
+            whole = kernel.run(0.05, y0, 90, np.array([20, 90])).states
+            carry = RunCheckpoint()
+            parts = [kernel.run(0.05, y0, n, np.array([n]), carry).states[0] for n in (20, 90)]
+        np.testing.assert_array_equal(np.stack(parts), whole)
+
+
+def test_the_code_does_not_depend_on_the_size():
+    few, many = (splitting_loops(ring(n)).functions(0, False) for n in (64, 6400))
+    assert few.function("run", 1) is many.function("run", 1)

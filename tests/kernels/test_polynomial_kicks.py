@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+import sympy as sp
 import torch
 
 from sympflow import systems
-from sympflow.hamiltonian.monomials import gradient, value
+from sympflow.hamiltonian.monomials import gradient, in_monomials, monomials, value
 from sympflow.integrators.splitting import Splitting
 from sympflow.kernels.splitting_loops import splitting_loops
 from sympflow.schemes import Scheme
@@ -73,3 +74,29 @@ def test_compiled_runs_are_the_steps_of_arrays(last, compensated):
 def test_tables_that_do_not_fit_are_refused(changes, message):
     with pytest.raises(ValueError, match=message):
         Scheme(**(vars(scheme()) | changes))
+
+
+@pytest.mark.parametrize("system", [HH, QUARTIC], ids=["henon_heiles", "quartic"])
+def test_monomials_hold_what_the_formula_of_baker_campbell_and_hausdorff_has(system):
+    """The force gradient, the curvature, and the next products of gradients."""
+    symbols = system.symbols
+    q, V = symbols.q, symbols.V
+
+    def product(f, g):
+        return sp.expand(sum(sp.diff(f, x) * sp.diff(g, x) for x in q))
+
+    second = product(V, V)
+    third = product(V, second)
+    for f in (V, second, third, product(second, second), product(V, third)):
+        degree = sp.Poly(f, *q).total_degree()
+        assert in_monomials(f, symbols, monomials(symbols, degree)) is not None
+
+
+def test_the_force_gradient_of_a_polynomial_is_one():
+    q = np.random.default_rng(0).normal(size=(5, 2))
+    symbols, of_kicks = QUARTIC.symbols, monomials(QUARTIC.symbols, 6)
+    e = in_monomials(symbols.force_gradient, symbols, of_kicks)
+    expected = -(QUARTIC.force(q) ** 2).sum(-1) / 2
+    np.testing.assert_allclose(value(of_kicks, e, q), expected, rtol=64 * EPS)
+    assert in_monomials(symbols.force_gradient, symbols, monomials(symbols, 4)) is None
+    assert in_monomials(sp.cos(symbols.q[0]), symbols, of_kicks) is None

@@ -1,16 +1,21 @@
 """The test whether any Hamiltonian explains the data, before fits: friction, another order of columns, no H at all."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from sympflow.learning.diagnosis import Cause, best_by_increments, hint
+from sympflow.learning.diagnosis import Cause, best_by_increments, forced, hint
 from sympflow.learning.families import FAMILIES
+from sympflow.learning.fitting import Setting
 from sympflow.learning.learner import _constraints
 from sympflow.learning.library import library_for
-from sympflow.learning.models import drags, frictions
+from sympflow.learning.models import drags, friction, frictions
 from sympflow.learning.parts import Drive, Polynomial
+from sympflow.learning.search import Search
 from sympflow.learning.trajectories import Trajectories
+from sympflow.training.session import Session
 
 
 def runs(field, d, n=6, span=6.0, points=31, width=1.0, noise=0.005):
@@ -100,3 +105,41 @@ def test_hints_name_the_reason_and_its_size(field, d, known, said):
     assert said in str(found)
     one = data.subset([0])
     assert "driven" not in str(hint(library_for(None, d, 4, one.smooth.points)[0], one.smooth, data, **known))
+
+
+def test_columns_in_the_wrong_order_are_told_before_any_other_model():
+    data = Trajectories.read(in_pairs(runs(henon_heiles, 2, n=5, width=0.3, span=4.0, points=21)))
+    search = Search(data, data.folds(), _constraints(data, None, None, False, None, None), Setting(), 0)
+    search.run([*FAMILIES], Session())
+    assert len(search.history) == 1
+    assert search.reading is not None
+    (freedom,) = search.tested
+    assert freedom.share < 0.1
+    assert freedom.defect > 0.1
+    assert freedom.rate == pytest.approx(0, abs=1e-10)  # the order of coordinates changes no volume
+    with pytest.warns(UserWarning, match=r'No symplectic map explains.*pass order="pairs"'):
+        search.diagnose(Session())
+
+
+@pytest.mark.parametrize("force", [friction, frictions])
+def test_drag_is_told_from_friction_that_was_learned(force):
+    """Drag in the place of friction explains more of quadratic drag, with as many numbers."""
+    data = Trajectories.read(runs(dragged, 1, span=8.0, points=81))
+    model = replace(candidates(data)[2], force=force)
+    best, reading, _ = best_by_increments(*data.split(), [model])
+    assert best == 0
+    assert reading.cause is Cause.DRAG
+    assert reading.factors(reading.theta) == pytest.approx([0.2], rel=0.05)
+    assert not forced(replace(model, force=drags))
+
+
+def test_friction_of_one_percent_is_named():
+    """It leaves more than half of the squares of a model without it, for most of them are noise."""
+    data = Trajectories.read(
+        runs(lambda t, y: [y[1], -np.sin(y[0]) - 0.01 * y[1]], 1, span=24.0, points=41, noise=0.02)
+    )
+    search = Search(data, [data.split(0.2, 0)], _constraints(data, None, None, False, 2 * np.pi, None), Setting(), 0)
+    search.run(["waves"], Session())
+    with pytest.warns(UserWarning, match=r"There is friction, γ = 0\.01\d*: .* Pass damping=True"):
+        search.diagnose(Session())
+    assert search.tested[0].rate == pytest.approx(-0.01, rel=0.2)

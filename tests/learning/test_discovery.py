@@ -6,6 +6,9 @@ import sympy as sp
 
 import sympflow
 from sympflow.learning.library import Library, coordinates, library_for, polynomials
+from sympflow.learning.orbits import Gauss, Method
+from sympflow.learning.shooting import Problem, minimized
+from sympflow.learning.trajectories import Trajectories
 from sympflow.systems import damped_pendulum, pendulum
 
 t = np.linspace(0, 5, 31)
@@ -115,3 +118,70 @@ def test_libraries_leave_out_what_the_data_cannot_tell():
     (a, b, *_), _ = coordinates(4)
     assert (a - b) ** 4 in four.expressions
     assert a * b not in four.expressions
+
+
+def test_degrees_and_milliseconds_give_the_same_formula(found):
+    times, y = measured(pendulum(), 0.01)
+    units = {"t": "ms", "q": "deg", "p": "deg/ms"}
+    again = sympflow.discover((1e3 * times, np.rad2deg(y) * [[1], [1e-3]]), ["p**2", "cos(q)", "q**2"], units=units)
+    assert again.discovery.terms == found.discovery.terms
+    np.testing.assert_allclose(again.discovery.coefficients, found.discovery.coefficients, rtol=1e-4)
+
+
+OSCILLATOR = "(p1**2 + p2**2 + q1**2 + q2**2)/2"
+
+
+TURNED = f"{OSCILLATOR} + 0.1*(q1*p2 - q2*p1)"
+
+
+@pytest.mark.parametrize(
+    ("H", "n", "seed"),
+    [
+        pytest.param(f"{OSCILLATOR} - sqrt(q1**2 + q2**2)", 10, 1, marks=pytest.mark.slow),  # a spring of length 1
+        pytest.param(f"{OSCILLATOR} - sqrt(q1**2 + q2**2)", 6, 4, marks=pytest.mark.slow),
+        pytest.param(OSCILLATOR, 10, 1, marks=pytest.mark.slow),
+        pytest.param(TURNED, 6, 2, marks=pytest.mark.slow),
+        pytest.param(TURNED, 10, 1, marks=pytest.mark.slow),
+        ("p1**2/2 + q1**2/2", 6, 2),
+    ],
+)
+def test_terms_that_are_nearly_alike_are_told_apart(H, n, seed):
+    """Cosines, powers and distances make up each other nearly; the search does not end among them."""
+    ndof = 2 if "q2" in H else 1
+    found = sympflow.discover(noisy(H, ndof, seed, n))
+    names = {s.name: s for pair in coordinates(ndof) for s in pair}
+    truth = sp.expand(sp.sympify(H, names)).as_coefficients_dict()
+    assert found.discovery.explains
+    assert set(found.discovery.terms) == set(truth)
+    for f, c, error in zip(found.discovery.terms, found.discovery.coefficients, found.discovery.errors, strict=True):
+        assert abs(c - float(truth[f])) < 5 * error
+
+
+def test_the_gain_of_a_term_is_what_its_fit_gains():
+    """An H(q, p) that is not separable; the linear model of a small coefficient is right to its size."""
+    library = Library([q**2, sp.cos(q), p**2, p**2 * q**2], 1)
+    assert library.by_kind().expressions == library.expressions
+    theta, sigma = np.array([0.4, -0.2, 0.5, 0.1]), np.array([0.1, 0.2])
+    method, starts = Method(Gauss(2), 0.1), np.array([[0.5, 0.3], [-0.2, 0.8]])
+    random = np.random.default_rng(0)
+    times = [np.cumsum(random.uniform(0.05, 0.4, n)) for n in (12, 9)]
+    blank = Trajectories.read([(one, np.zeros((2, len(one)))) for one in times])
+    orbits = Problem(library.model(), blank, method, sigma).orbits(theta, starts)
+    data = Trajectories.read([*zip(times, orbits, strict=True)])
+    fewer = minimized(Problem(library.subset([0, 1, 2]).model(), data, method, sigma), theta[:3], starts, gain=1e-9)
+    whole = Problem(library.model(), data, method, sigma)
+    gains = whole.normal(np.array([*fewer.theta, 0.0]), fewer.states).gains(np.array([True, True, True, False]))
+    left = minimized(whole, theta, starts).cost
+    assert (gains[:3] == 0).all()
+    assert gains[3] == pytest.approx(fewer.cost - left, rel=0.1)
+    assert left < 1e-20
+
+
+def test_outliers_are_left_to_hubers_loss():
+    """Every tenth value is off by 50 σ; the noise is found to the share that they leave of it."""
+    times, y = measured(pendulum(), 0.01)
+    y[:, 0, ::10] += 0.5
+    record = sympflow.discover((times, y), ["p**2", "cos(q)", "q**2"], loss="huber").discovery
+    assert set(record.terms) == {sp.cos(q), p**2}
+    np.testing.assert_allclose(sorted(record.coefficients), [-1.0, 0.5], rtol=0.01)
+    assert record.noise == pytest.approx([0.012, 0.01], rel=0.25)

@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 
 import sympflow
 from sympflow.learning.families import FAMILIES
-from sympflow.learning.fitting import Setting, fitted, restored
+from sympflow.learning.fitting import Setting, fitted, judged, left_out, restored
 from sympflow.learning.inertia import Inertia
 from sympflow.learning.learner import _constraints
 from sympflow.learning.library import Library, Terms
@@ -465,3 +465,154 @@ def test_a_part_of_many_numbers_or_pieces_of_one_run_choose_the_model(monkeypatc
     found = [float(H.coeff_monomial(powers)) for powers in ((0, 2), (2, 0), (4, 0))]
     assert found == pytest.approx([0.5, 0.5, 0.25], abs=1e-3)
     assert flow.figures["held_out_trajectories"] in held_out
+
+
+def test_outliers_count_less_by_hubers_loss():
+    runs = trajectories(8, 15, noise=0.01)
+    for _, y in runs:
+        y[1, 7] += 1.0
+    data = Trajectories.read(runs)
+    errors = []
+    for huber in (None, 1.5):
+        theta, fit = problem(quartic(data), data, np.full(2, 0.01), huber=huber)
+        found = minimized(fit, theta, first_states(data))
+        (coefficient,) = quartic(data).parts[0].coefficients(found.theta[:1])
+        errors.append(abs(coefficient - 1 / (2 * MASS)) / coefficient)
+        deviation = np.sqrt(found.covariance()[0, 0]) / found.theta[0]
+    assert errors[1] < 3 * deviation < errors[0]
+
+
+def test_data_of_no_hamiltonian_are_called_so():
+    """A damped oscillator, without a word of friction: the areas shrink at its rate."""
+    data = Trajectories.read(trajectories(8, 15, rate=RATE))
+    search = Search(data, [data.split(0.2, 0)], _constraints(data, None, None, False, None, None), Setting(), 0)
+    search.run(["polynomial"], Session())
+    with pytest.warns(UserWarning, match=r"No symplectic map explains.*rate of -0\.2") as record:
+        search.diagnose(Session())
+    (freedom,) = search.tested
+    assert freedom.share < 1e-3
+    assert 0.05 < freedom.defect < 0.2  # of L the friction is a fifth of the frequency, about 1, in one entry of four
+    assert "damping" in str(record[0].message)
+
+
+@pytest.mark.slow
+def test_bands_cover_the_truth_as_often_as_they_say():
+    """For 20 sets of nine trajectories; quantiles of 20 replicas covered 82 % in place of 90."""
+    times = np.linspace(0, 4, 5)
+    field = lambda t, y: [y[1] / MASS, -STIFF * y[0] - QUARTIC * y[0] ** 3]  # noqa: E731
+    true = solve_ivp(field, (0, 4), [0.5, 0.0], t_eval=times, rtol=1e-12, atol=1e-13).y
+    model = Model(1, (known_kinetic(np.array([[1 / MASS]])), Polynomial("q", [[2], [4]], [1.0])))
+    inside = []
+    for seed in range(20):
+        data = Trajectories.read(trajectories(9, 15, noise=0.05, seed=seed))
+        found = fitted(model, data, Setting())
+        thetas = np.stack([replica((model, data, Setting(), found.theta, seed), k) for k in range(20)])
+        low, high = Replicas(model, found.method, found.theta, thetas, 9).bands([0.5, 0.0], times)
+        inside.append(((low <= true) & (true <= high))[:, 1:].mean())
+    assert np.mean(inside) == pytest.approx(0.9, abs=1.5 * 0.3 / np.sqrt(20))  # values of one set are correlated
+
+
+@pytest.mark.slow
+def test_a_flow_of_data_that_do_not_tell_h_is_of_these_data():
+    """Circular orbits of one radius: V may be any function with one slope there."""
+    t = np.linspace(0, 6, 31)
+    angle = np.linspace(0, 5, 10)[:, None] + t
+    y = np.stack([np.cos(angle), np.sin(angle), -np.sin(angle), np.cos(angle)], 1)
+    with pytest.warns(UserWarning, match=r"do not tell H beyond themselves: .* q1\*\*2 \+ q2\*\*2 is the same"):
+        flow = sympflow.learn((t, y), time_budget=20)
+    assert flow.domain.contains(y[0].T).all()
+    assert not flow.domain.contains(np.zeros((1, 4))).any()
+
+
+def test_residuals_beyond_the_noise_of_the_data_are_not_explained():
+    """Silent residuals of a model that fits nothing, as of pieces too short to tell, count by their size."""
+    data = Trajectories.read(trajectories(4, 16, noise=0.01))
+    wrong = Model(1, (known_kinetic(np.eye(1)), Polynomial("q", [[2]], [1.0])))
+    setting = Setting(seen=data.smooth.sigma)
+    held = left_out(fitted(wrong, data, setting), data.folds(), setting)
+    assert len(held.losses) == 4
+    assert held.excess > 2
+    assert not held.explained
+    assert "noise that is seen without a model" in held.complaint
+    right = left_out(fitted(quartic(data), data, setting), data.folds(), setting)
+    assert right.explained
+
+
+@pytest.mark.slow
+def test_noise_alone_and_a_noise_that_is_too_small_are_called_so():
+    random, t = np.random.default_rng(0), np.linspace(0, 4, 21)
+    data = Trajectories.read((t, random.normal(size=(6, 2, 21))))
+    search = Search(data, [data.split(0.2, 0)], _constraints(data, None, None, False, None, None), Setting(), 0)
+    search.run(["polynomial"], Session())
+    with pytest.warns(UserWarning, match="explains next to nothing"):
+        search.diagnose(Session())
+    data = Trajectories.read(trajectories(6, 12, noise=0.02))
+    held = judged(fitted(quartic(data), data, Setting(np.full(2, 0.002))), data, Setting(np.full(2, 0.002)))
+    assert held.loudness == pytest.approx(10, rel=0.2)  # the initial states take a twelfth of it
+    assert not held.explained
+    assert "times the noise" in held.complaint
+
+
+def test_networks_grow_no_steps():
+    """A jump of the force by a coarse step of the data is met by a neuron of bounded slope, not by a step."""
+    q = np.linspace(-1, 1, 41)
+    runs = [(np.linspace(0, 1, 41), np.stack([q, np.sign(q + shift)])) for shift in (0.0, 0.01)]
+    data = Trajectories.read(runs)
+    model = Model(1, (known_kinetic(np.eye(1)), Network("q", 3, data.scales[:1])))
+    theta = matched(model, model.start(np.random.default_rng(0)), data, 1 / data.scales, 60)
+    a = np.abs(theta[3:])
+    assert a.max() < 40
+    fit = Problem(model, data.pieces(10), chosen_method(model, theta, data, data.scales), data.scales)
+    states, h = first_states(fit.data), 1e-5
+    normal = fit.normal(theta, states)
+    for i in (0, 3, 8):  # a weight of the sum, of a coordinate, a bias: their cost is in the normal equations
+        e = h * np.eye(model.n)[i]
+        assert (fit.cost(theta + e, states) - fit.cost(theta - e, states)) / (-4 * h) == pytest.approx(
+            normal.c[i], rel=1e-4, abs=1e-6
+        )
+    assert normal.cost == pytest.approx(fit.cost(theta, states), rel=1e-12)
+
+
+def orbits(t):
+    rng = np.random.default_rng(0)
+    for _ in range(6):
+        y = solve_ivp(lambda t, y: [y[1], -y[0] - y[0] ** 3], (0, t[-1]), rng.uniform(-1, 1, 2), t_eval=t, rtol=1e-9).y
+        yield t, y + 0.005 * rng.normal(size=y.shape)
+
+
+def test_units_of_any_size_give_the_same_formula():
+    """A step of the fit knows no unit: q in 1e20, p in 1e-20, and all as integers, single numbers or objects."""
+    t = np.linspace(0, 6, 31)
+    y = np.array([y for _, y in orbits(t)]) * np.ones((1, 2, 1))
+    terms = ["p**2", "q**2", "q**3", "q**4", "q*p"]
+    found = [sympflow.discover((t, y.astype(kind)), terms).discovery for kind in (float, np.float32)]
+    found.append(sympflow.discover((t, y.astype(object) * np.array([[1e20], [1e-20]])), terms).discovery)
+    for one in found:
+        assert [str(f) for f in one.terms] == ["p1**2", "q1**2", "q1**4"]
+    mixed = found[2].coefficients / found[0].coefficients
+    assert mixed == pytest.approx([1e40, 1e-40, 1e-80], rel=1e-3)
+
+
+def test_learn_returns_a_flow_of_what_it_found(noisy):
+    """The flow is that of the H that was found, which misses the true one by less than half of the noise."""
+    x = np.array([[0.5, -0.4], [-0.7, 0.3]])
+    exact = [
+        solve_ivp(lambda t, y: [y[1] / MASS, -STIFF * y[0] - QUARTIC * y[0] ** 3], (0, 0.5), row, rtol=1e-10).y[:, -1]
+        for row in x
+    ]
+    import torch
+
+    assert noisy(0.5, torch.tensor(x)).numpy() == pytest.approx(np.array(exact), abs=0.005)
+    sol = sympflow.solve(noisy.system, noisy, t_span=(0, 50), y0=x[0], dt=0.5, backend="array")
+    assert sympflow.max_energy_error(sol) < 1e-8
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("damping", [True, "each"])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_friction_that_chance_makes_negative_is_none(damping, seed):
+    """Data without friction: one rate in two is below 0 by chance."""
+    data = trajectories(6, 10, noise=0.01, seed=seed)
+    found = sympflow.learn(data, damping=damping, family="polynomial", time_budget=None)
+    friction = found.system.friction
+    assert 0 <= friction.largest < 0.01

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 import sympflow
-from sympflow.learning.families import FAMILIES
+from sympflow.learning.families import FAMILIES, Constraints
 from sympflow.learning.fitting import Setting, fitted
 from sympflow.learning.lagrangian import lagrangian_start
 from sympflow.learning.learner import _constraints
 from sympflow.learning.models import friction
+from sympflow.learning.parts import Fixed, Polynomial, kinetic
 from sympflow.learning.trajectories import Trajectories
 from sympflow.systems import double_pendulum
 
@@ -133,3 +134,35 @@ def test_learn_gives_h_and_the_momenta():
 def test_velocities_of_no_momenta_are_refused():
     with pytest.raises(ValueError, match="`v`: Newton's method finds no momenta"):
         sympflow.HamiltonianSystem.from_sympy("sqrt(1 + p**2) + q**2").momenta(np.zeros((1, 1)), np.full((1, 1), 2.0))
+
+
+def test_the_noise_of_velocities_biases_nothing():
+    """Within four standard errors; of velocities that nobody observed there is no noise."""
+    for observed in ("qv", "q"):
+        data, _ = observations(PENDULUM, observed, runs=10, noise=0.01)
+        found = fitted(candidate("waves", data, 0, 2 * np.pi), data, Setting())
+        error = np.sqrt(found.fit.covariance()[0, 0])
+        assert abs(found.theta[0] + 2) < 4 * error < 0.2  # V = −2cos q, with M = 1
+        assert found.sigma[0] == pytest.approx(0.01, rel=0.1)
+
+
+def test_only_the_factor_of_h_is_given():
+    """(M⁻¹)₁₁ = 1 beside the numbers of all others."""
+    constraints = Constraints(np.ones(4), None, None, None, np.full(4, np.inf), velocities=True, middle=np.zeros(2))
+    model = constraints.separated(Polynomial.up_to(2, "q", np.ones(2)))
+    assert model.n == kinetic([1.0, 1.0]).n - 1 + 5
+    assert isinstance(model.parts[0], Fixed)
+    W = model.field(np.ones(model.n), np.eye(4), True, False).slope[:2, 2:]
+    assert np.broadcast_to(W, (2, 2, 4))[..., 0] == pytest.approx(np.array([[1.0, 1.0], [1.0, 2.0]]))
+
+
+@pytest.mark.parametrize(
+    ("system", "v"),
+    [(PENDULUM, [[0.6]]), (CHARGE, [[0.6, -0.4]]), (double_pendulum(), [[0.6, -0.4]]),
+     (sympflow.HamiltonianSystem.from_sympy("sqrt(1 + p**2) + q**2"), [[0.6]])],
+    ids=lambda value: getattr(value, "name", None),
+)  # fmt: skip
+def test_momenta_are_those_of_velocities(system, v):
+    q = 0.3 * np.ones((1, system.ndof))
+    found = system.vector_field(np.concatenate([q, system.momenta(q, np.array(v))], axis=1))[:, : system.ndof]
+    assert found == pytest.approx(np.array(v), abs=1e-12)

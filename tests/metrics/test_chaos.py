@@ -170,3 +170,51 @@ def test_a_large_lattice_has_vectors_without_matrices():
     assert found.status == 0
     with pytest.raises(ValueError, match=r"^`system` has 40,000 degrees of freedom.*of an implicit step.*srkn6b"):
         sympflow.solve(lattice, "gauss_legendre4", (0, 0.1), np.zeros(80_000), dt=0.1)
+
+
+def test_a_chaotic_orbit_is_told_from_a_regular_one(wells):
+    index = sympflow.sali(wells, "verlet", (0, 3000), BOTH, dt=0.1)
+    assert index.status.tolist() == [1, 0]
+    assert index.success
+    assert index.value[0] < 1e-12
+    assert 300 < index.t_end[0] < 1500  # exp(−λt) = 1e-12, λ about 0.04
+    assert index.value[1] > 0.1
+    assert "1 of 2 orbits ended early" in index.message
+
+
+@pytest.mark.slow
+def test_the_exponents_of_henon_heiles(wells):
+    exponents = sympflow.lyapunov(wells, "verlet", (0, 2e5), BOTH, dt=0.1, t_eval=[2e3, 2e4])
+    assert 0.035 < exponents.value[0] < 0.055  # 0.047 by Skokos (2001)
+    # the vectors of a regular orbit grow like t
+    assert (exponents.history[1] < 2 * np.log(exponents.t) / exponents.t).all()
+
+
+def test_gali_of_two_vectors_is_sali_times_the_other_diagonal(wells):
+    s = sympflow.sali(wells, "verlet", (0, 50), BOTH, dt=0.1, below=0).value
+    g = sympflow.gali(wells, "verlet", (0, 50), BOTH, dt=0.1, below=0).value
+    np.testing.assert_allclose(g, s * np.sqrt(4 - s**2) / 2, rtol=1e-12)
+
+
+@pytest.mark.slow
+def test_the_exponent_of_a_ridge_with_friction():
+    """λ of q'' = q − γq' is (−γ + √(γ² + 4))/2; the verlet step has this rate up to O(h²)."""
+    y0, gamma = [1e-3, 2e-3], 0.4
+    system = HamiltonianSystem.from_sympy("p**2/2 - q**2/2", damping=gamma, name="ridge")
+    compiled, arrays = both_ways(sympflow.lyapunov, system, "verlet", (0, 40), y0, dt=0.02, deviations=[1.0, 0.5])
+    np.testing.assert_allclose(compiled.value, arrays.value, rtol=1e-10)
+    np.testing.assert_allclose(compiled.value, (-gamma + np.sqrt(gamma**2 + 4)) / 2, atol=0.02)
+
+
+@pytest.mark.parametrize("method", ["srkn6b", "chin4a", "linear_srkn6b"])
+def test_the_exponent_of_a_lattice_is_that_of_its_coordinates(method):
+    lattice = HamiltonianSystem.lattice(bond="r**2/2 + r**4/4", shape=8)
+    written = HamiltonianSystem.from_sympy(str(lattice.local.written_out()))
+    y0 = np.random.default_rng(0).normal(size=16) / 2
+    found = [sympflow.lyapunov(system, method, (0, 10), y0, dt=0.05) for system in (lattice, written)]
+    assert found[0].value == pytest.approx(found[1].value, abs=1e-12)
+
+
+def test_backwards(wells):
+    back = both_ways(sympflow.sali, wells, "verlet", (0, -10), BOTH, dt=0.1, t_eval=[-3, -5], below=0)
+    np.testing.assert_allclose(back[0].history, back[1].history, rtol=1e-9)

@@ -41,3 +41,9 @@ def test_kinetic_energies_that_depend_on_the_time_and_autonomous_systems():
     assert energy_balance_error(sol).max() < 1e-11
     alone = solve(sympflow.systems.pendulum(), "verlet", (0, 5), dt=0.1)
     assert np.allclose(energy_balance_error(alone), np.abs(sympflow.energy_error(alone, relative=False)), atol=1e-15)
+
+
+def test_drives_with_kinks_are_balanced_too():
+    system = HamiltonianSystem.from_sympy("p**2/2 + q**2/2 - q*abs(sin(t))", time="t")
+    sol = solve(system, "kahan_li8", (0, 20), Y0, dt=0.05)
+    assert energy_balance_error(sol).max() < 1e-11

@@ -7,7 +7,7 @@ from scipy.special import ellipk
 
 import sympflow
 from sympflow.metrics.frequencies import lines
-from sympflow.systems import henon_heiles_escape, pendulum
+from sympflow.systems import harmonic_oscillator, henon_heiles_escape, pendulum
 
 
 def test_lines_of_a_quasi_periodic_signal():
@@ -78,3 +78,12 @@ def test_a_turning_angle_needs_a_signal():
     found = sympflow.frequencies("p**2/2 - cos(q)", signal=lambda y: np.exp(1j * y[..., :1, :]), **run)
     assert found.frequencies[0, 0] == pytest.approx(2 * np.pi / (4 * ellipk(4 / 9) / 3), abs=1e-8)
     assert found.message == "The solver successfully reached the end of the integration interval."
+
+
+def test_the_frequency_of_an_oscillator():
+    system = harmonic_oscillator()
+    found = sympflow.frequencies(system, "impulse", (0, 100), [1.0, 0.0], dt=0.1, n=2)  # its flow is exact
+    assert found.frequencies[0, 0] == pytest.approx(1, abs=1e-13)
+    assert np.isnan(found.frequencies[0, 1])  # there is no other line
+    assert found.amplitudes[0, 0] == pytest.approx(1, abs=1e-12)
+    assert found.success

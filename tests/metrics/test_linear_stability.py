@@ -1,11 +1,12 @@
 """Linear stability: the trace of a step on the oscillator, its exits from [−2, 2], and what touches without one."""
 
 import math
+from fractions import Fraction
 
 import numpy as np
 import pytest
 
-from sympflow import HamiltonianSystem, get, systems
+from sympflow import HamiltonianSystem, get, max_energy_error, solve, systems
 from sympflow.metrics.linear_stability import half_trace, linear_stability, of_method, small_oscillations
 from sympflow.schemes import SCHEMES, compose
 
@@ -108,3 +109,52 @@ def test_a_resonance_of_the_impulse_method_is_a_window():
     outside = h[np.abs(np.cos(5 * h) + h / 10 * np.sin(5 * h)) > 1]
     assert found.windows[0].start == pytest.approx(outside[0], abs=2e-4)
     assert found.windows[0].stop == pytest.approx(outside[-1], abs=2e-4)
+
+
+def test_the_trace_is_exact():
+    assert half_trace(SCHEMES["verlet"]) == (1, Fraction(-1, 2))
+    sixth = Fraction(1.0 / 6.0)  # of Chin's table as it is stored
+    a, b, g = Fraction(1, 2), (sixth, Fraction(2.0 / 3.0)), Fraction(1.0 / 36.0)
+    assert half_trace(SCHEMES["chin4a"])[1] == -a * (2 * b[0] + b[1])
+    assert half_trace(SCHEMES["chin4a"])[3] == -(a**2) * b[0] * g
+
+
+@pytest.mark.parametrize(("name", "inside"), [("srkn14a", 3.1415), ("omelyan4", 3.145), ("mclachlan4", 3.1)])
+def test_a_run_in_a_narrow_window_is_lost_and_beside_it_is_not(name, inside):
+    """The window of SRKN 14a is 0.0012 wide and its growth 1.0006 a step: enough in 1e5 of them."""
+    (first, *_), oscillator = linear_stability(name).windows, systems.harmonic_oscillator()
+    assert first.start < inside < first.stop
+    for z, lost in ((0.999 * first.start, False), (inside, True), (1.002 * first.stop, False)):
+        sol = solve(oscillator, name, (0, 1e5 * z), [1.0, 0.3], dt=z, save_every=1000)
+        assert (max_energy_error(sol) > 1e6) == lost
+
+
+BOUNDS = {"verlet": lambda z: z**2 / 4, "leapfrog": lambda z: z**2 / 4 / (1 - z**2 / 4)}
+
+
+@pytest.mark.parametrize(
+    ("method", "omega", "z"),
+    [("verlet", 1.0, 1.99), ("verlet", 1e6, 0.1), ("leapfrog", 1e3, 1.9), ("leapfrog", 1e6, 1.99)],
+)
+def test_the_energy_error_approaches_its_bound_and_stays_below(method, omega, z):
+    """And beyond the limit the state grows by the root of λ² − 2cλ + 1, c = 1 − z²/2."""
+    error = max_energy_error(solve(systems.harmonic_oscillator(omega), method, (0.0, 1e5 * z / omega), dt=z / omega))
+    bound = BOUNDS[method](z)
+    # rounding of 1e5 steps, amplified by the eccentricity of the ellipse that the iterates lie on
+    assert 0.99 * bound < error < bound * (1 + 1e5 * np.finfo(float).eps / (2 - z))
+    q, beyond = (
+        solve(systems.harmonic_oscillator(omega), method, (0.0, 201 / omega), dt=2.01 / omega).q[0],
+        2.01**2 / 2 - 1,
+    )
+    assert abs(q[-1] / q[-2]) == pytest.approx(beyond + np.sqrt(beyond**2 - 1), rel=1e-6)  # 1.2213
+
+
+def test_windows_of_several_frequencies_are_united():
+    found = linear_stability("mclachlan4")
+    (a, b, growth), (c, *_) = found.windows
+    both = found.in_steps([0.0, 1.0, 2.0])
+    assert both.intervals == ((0.0, a / 2), (b / 2, a), (b, c / 2))
+    assert both.windows[0].growth == growth
+    assert both.window_of(a).stop == b
+    assert found.in_steps([]).limit == math.inf
+    assert found.in_steps([4.0]).limit == a / 4

@@ -67,3 +67,13 @@ def test_a_method_without_backward_time_is_named():
     sol = solve(systems.henon_heiles(), "mlp", (0, 5))
     with pytest.raises(TypeError, match=r"^`sol` is of method 'mlp', which cannot run backwards.*: use a symplectic"):
         time_reversal_error(sol)
+
+
+def test_reference_of_coupled_oscillators_satisfies_the_equations():
+    system = HamiltonianSystem.from_sympy("p1**2/2 + p2**2/4 + p1*p2/5 + q1**2 + 3*q2**2 + q1*q2")
+    t = np.linspace(0, 3, 61)
+    y0 = np.array([1.0, -0.5, 0.2, 0.7])
+    exact = reference(system, (0, 3), y0, t)
+    assert exact.method.startswith("exact")
+    sol = solve(system, "dop853", (0, 3), y0, t_eval=t, rtol=1e-13, atol=1e-14)
+    np.testing.assert_allclose(exact.y, sol.y, atol=1e-11)

@@ -68,3 +68,30 @@ def test_the_error_is_infinite_where_the_energy_is_beyond_floats():
     assert np.isposinf(sol.energy_error()[0]).all()
     assert np.isfinite(sol.energy_error()[1]).all()
     np.testing.assert_array_equal(np.isinf(max_energy_error(sol)), [True, False])
+
+
+def test_one_nan_is_not_hidden_by_the_maximum():
+    sol = solve(systems.harmonic_oscillator(), "verlet", (0, 1))
+    y = sol.y.copy()
+    y[:, 3] = np.nan
+    assert max_energy_error(replace(sol, y=y)) == np.inf
+
+
+@pytest.mark.filterwarnings("ignore:`rtol` is too large for method .rk45.:RuntimeWarning")
+def test_drift_of_verlet_is_insignificant_and_that_of_rk45_is_not():
+    system, t = systems.henon_heiles(), np.linspace(0, 400, 4001)
+    verlet, rk45 = (energy_drift(solve(system, method, (0, 400), t_eval=t)) for method in ("verlet", "rk45"))
+    assert abs(verlet.slope) < 4 * verlet.standard_error
+    assert rk45.slope < -10 * rk45.standard_error
+
+
+def test_standard_error_of_the_drift_is_that_of_white_noise():
+    """For independent samples of deviation σ over [0, T] the slope has deviation √12 σ / (T √n)."""
+    n, T, sigma, runs = 4000, 10.0, 0.3, 400
+    system = HamiltonianSystem.from_sympy("p**2/2 + q", energy_scale=1.0)
+    noise = np.random.default_rng(0).normal(0, sigma, (runs, n))
+    sol = solve(system, "verlet", (0, T), np.zeros((runs, 2)), t_eval=np.linspace(0, T, n), backend="array")
+    drift = energy_drift(replace(sol, y=np.stack([noise, 0 * noise], axis=1)))
+    expected = np.sqrt(12 / n) * sigma / T
+    assert drift.slope.std() == pytest.approx(expected, rel=0.12)  # the deviation of 400 draws is known to 3.5 %
+    assert np.sqrt((drift.standard_error**2).mean()) == pytest.approx(expected, rel=0.06)

@@ -12,7 +12,7 @@ from conftest import refusals
 from sympflow import HamiltonianSystem, get, loop_area_error, solve, symplecticity_defect, systems, volume_error
 from sympflow.flow.shipped import shipped
 from sympflow.integrators.base import FixedStep
-from sympflow.metrics.symplectic import loop_area, step_tangents
+from sympflow.metrics.symplectic import loop_area, natural_scale, step_tangents
 
 pytestmark = pytest.mark.filterwarnings("ignore:`dt` .* is too long:RuntimeWarning")
 
@@ -133,3 +133,51 @@ test_refusals = refusals(
     (of(loop_area_error, systems.pendulum()), "`sol` must start from a loop"),
     (of(loop_area_error, systems.pendulum(), np.ones((16, 2))), "without area"),
 )
+
+
+def test_volume_over_time_is_the_running_sum_of_the_steps_that_have_ended():
+    system = systems.pendulum()
+    sol = solve(system, Damped(dt=0.1), (0, 100), t_eval=[0, 0.05, 0.1, 0.25, 60, 99.99, 100])
+    expected = np.log(0.9) * np.array([0, 0, 1, 2, 600, 999, 1000])
+    np.testing.assert_allclose(volume_error(sol, over_time=True), expected, rtol=1e-11)
+    back = solve(system, Damped(dt=0.1), (10, 0), t_eval=[10, 9.85, 0])
+    np.testing.assert_allclose(volume_error(back, over_time=True), np.log(0.9) * np.array([0, 1, 100]), rtol=1e-11)
+
+
+@pytest.mark.parametrize("omega", [1.0, 1e3, 1e6])
+def test_scaled_defect_is_the_same_at_every_frequency(omega):
+    """In (√ω q, p/√ω) the step of length z/ω is the same matrix for every ω."""
+    system = systems.harmonic_oscillator(omega)
+    np.testing.assert_allclose(natural_scale(system), np.sqrt(omega), rtol=1e-14)
+    sol = solve(system, "rk45", (0, 0.5 / omega), first_step=0.5 / omega, rtol=1e3, atol=1e3)
+    R = sum(c * (0.5j) ** k for k, c in enumerate([1, 1, 1 / 2, 1 / 6, 1 / 24, 1 / 120, 1 / 600]))
+    assert symplecticity_defect(sol) == pytest.approx(1 - abs(R) ** 2, rel=1e-8)
+    verlet = solve(system, "verlet", (0, 100 / omega), dt=1 / omega)
+    assert symplecticity_defect(verlet) < 10 * EPS
+
+
+def test_determinant_one_is_weaker_than_symplectic():
+    """(q₁, q₂, p₁, p₂) ↦ (q₁, q₂, 2p₁, p₂/2) keeps volume and is not symplectic: its defect is 1."""
+
+    @dataclass(frozen=True)
+    class Squeeze(FixedStep):
+        name: ClassVar[str] = "squeeze"
+        order: ClassVar[int | None] = None
+        symplectic: ClassVar[bool] = False
+
+        def step(self, system, t, y, h):
+            factors = [1.0, 1.0, 2.0, 0.5]
+            return y * (y.new_tensor(factors) if torch.is_tensor(y) else np.array(factors))
+
+    sol = solve(systems.henon_heiles(), Squeeze(dt=1.0), (0, 3))
+    assert abs(volume_error(sol)) < 1e-15
+    assert symplecticity_defect(sol) == pytest.approx(1.0)
+
+
+def test_symplectic_methods_carry_a_loop_with_its_area():
+    system, t = systems.pendulum(), np.linspace(0, 20, 5)
+    sol = solve(system, "verlet", (0, 20), circle(256), t_eval=t, dt=0.5)  # a large step: not accurate, but symplectic
+    assert loop_area_error(sol).shape == (5,)
+    assert np.abs(loop_area_error(sol)).max() < 1e-12
+    damped = solve(system, Damped(dt=0.5, factor=0.99), (0, 20), circle(256), t_eval=t)
+    np.testing.assert_allclose(loop_area_error(damped), 0.99 ** (t / 0.5) - 1, rtol=1e-9, atol=1e-14)

@@ -58,3 +58,22 @@ def test_what_it_needs_is_said(runs):
     few = solve(systems.pendulum(), "verlet", (0, 1000), t_eval=[0, 500, 1000])
     with pytest.raises(ValueError, match=r"^`sol` has outputs in 1 of .* windows between"):
         energy_growth(few)
+
+
+def test_a_primed_flow_sums_with_compensation_too():
+    import torch
+
+    from sympflow import SympFlow
+
+    system, n = systems.henon_heiles(), 300_000
+    flow = SympFlow.primed(system, scheme="kahan_li8", dt=0.05)
+    y0 = system.domain.sample(8, 3)
+    rms = [
+        energy_growth(
+            solve(system, "sympflow", (0, 0.05 * n), y0, flow=flow, compensated=compensated, save_every=100)
+        ).rms[-1]
+        for compensated in (False, True)
+    ]
+    assert rms[1] < rms[0] / 4
+    with pytest.raises(ValueError, match=r"^`compensated` sums need the compiled loops of a primed flow"):
+        solve(system, "sympflow", (0, 1), torch.from_numpy(y0), flow=flow, compensated=True)

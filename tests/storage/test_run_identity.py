@@ -234,3 +234,37 @@ def test_functions_are_known_by_the_globals_that_they_and_their_helpers_name(mon
     assert digest(function) == before
     monkeypatch.setattr(largest, "__defaults__", (2.0,))
     assert digest(function) != before
+
+
+def test_drawn_states_are_all_compared(tmp_path):
+    """Two samplers that agree in their first states."""
+
+    def sampler(last):
+        def draw(rng, n):
+            y = rng.uniform(-0.1, 0.1, (n, 4))
+            y[-1] += last
+            return y
+
+        return draw
+
+    def run(last, **how):
+        how = {"n": 4096, "dt": 0.1, "reduce": "final", "store": tmp_path / "a"} | how
+        return sympflow.ensemble(sympflow.systems.henon_heiles(), "verlet", (0, 1), sampler(last), **how)
+
+    run(0.0)
+    run(0.0, resume=True)
+    with pytest.raises(ValueError, match="its `y0` is 4096 states by seed 0"):
+        run(0.01, resume=True)
+
+
+def test_what_was_used_is_the_same():
+    """Cached values, generated functions and compiled code are no part of a thing."""
+    for thing, use in (
+        (Scaled(2.0), lambda s: s.found),
+        (sympflow.systems.henon_heiles(), lambda s: (s.vector_field(s.y0), s.expression, s.fingerprint)),
+        (sympflow.systems.fput(8), lambda s: (s.vector_field(s.y0), s.linear_part)),
+        (njit(lambda x: x + 1), lambda f: f(1.0)),
+    ):
+        before = digest(thing)
+        use(thing)
+        assert digest(thing) == before

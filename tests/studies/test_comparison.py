@@ -1,5 +1,7 @@
 """compare(): rows, files, and methods matched to each other."""
 
+import csv
+import json
 import math
 
 import numpy as np
@@ -7,6 +9,8 @@ import pytest
 
 from sympflow import HamiltonianSystem, compare, get, reference_error, solve, systems
 from sympflow.metrics.reference import Reference
+from sympflow.studies.attempts import Row
+from sympflow.studies.comparison import matched
 
 QUICK = {"n_outputs": 50, "repeats": 1}
 
@@ -140,3 +144,47 @@ def test_the_default_metrics_are_those_of_what_a_system_keeps(scene, metrics, tm
     report.plot(tmp_path)
     assert (tmp_path / "portrait.png").exists()
     assert (tmp_path / "energy.png").exists() == (kept == "balance_error")
+
+
+def test_a_batch_is_summed_up_by_its_median_and_its_worst():
+    system = systems.henon_heiles()
+    y0 = system.domain.sample(5, 0)
+    report = compare(system, ["verlet", "rk45"], y0=y0, t_span=(0, 5), **QUICK)
+    alone = [compare(system, ["rk45"], y0=y, t_span=(0, 5), **QUICK).rows[0] for y in y0]
+    rk45 = report.rows[1]
+    assert rk45.error == pytest.approx(np.median([row.error for row in alone]), rel=1e-6)
+    assert rk45.volume_error == pytest.approx(max((row.volume_error for row in alone), key=abs), rel=1e-9)
+
+
+def test_matching_finds_the_step_of_a_power_law():
+    system = systems.pendulum()
+    for power, grows in ((2.0, True), (-1.0, False), (6.0, True)):
+        found, value = matched(get("verlet")(dt=0.1), system, lambda m, n=power: m.dt**n, 0.003**power, grows)
+        assert value == pytest.approx(0.003**power, rel=0.05)
+        assert found.dt == pytest.approx(0.003, rel=0.06)
+    found, _ = matched(get("verlet")(dt=1.0), system, lambda m: math.inf if m.dt > 0.5 else m.dt**2, 0.2**2, grows=True)
+    assert found.dt == pytest.approx(0.2, rel=0.05)
+
+
+def test_files_hold_every_figure(report, tmp_path):
+    with report.to_csv(tmp_path / "new" / "rows.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["label"] for row in rows] == [row.label for row in report.rows]
+    assert float(rows[0]["energy_error"]) == report.rows[0].energy_error
+    assert rows[0]["training_time"] == ""
+    content = json.loads(report.to_json(tmp_path / "rows.json").read_text())
+    assert content["rows"][0]["energy_error"] == report.rows[0].energy_error
+    assert content["reference"]["method"].startswith("Kahan–Li 8")
+
+
+def test_metrics_that_were_not_asked_for_are_none():
+    row = compare(systems.pendulum(), ["verlet"], ["energy"], **QUICK).rows[0]
+    assert row.energy_error > 0
+    assert (row.error, row.energy_drift, row.volume_error, row.symplecticity_defect, row.training_time) == (None,) * 5
+
+
+def test_the_repr_of_a_row_shows_what_is_filled_in():
+    row = Row("pendulum", "verlet", "verlet", energy_error=0.0, run_time=1.5)
+    assert repr(row) == (
+        "Row(system='pendulum', method='verlet', label='verlet', status='ok', run_time=1.5, energy_error=0.0)"
+    )

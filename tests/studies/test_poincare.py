@@ -180,3 +180,51 @@ def test_orbits_of_one_energy_start_on_the_plane(system, energy, direction):
     if system.ndof == 2:
         spread = np.abs(section.y0[:, 1]).max() / np.abs(section.y0[:, 1]).min()
         assert spread > 10
+
+
+def test_all_zeros_of_cos_t_upwards_and_downwards(rotation):
+    zeros = np.pi * (np.arange(16) + 0.5)
+    for t_end in (50.0, -50.0):
+        for direction, expected in ((0, zeros), (-1, zeros[0::2]), (1, zeros[1::2])):
+            section = poincare_section(OSCILLATOR, rotation, (0.0, t_end), [1.0, 0.0], direction=direction)
+            np.testing.assert_allclose(np.abs(section.t), expected, rtol=0, atol=1e-10)
+
+
+def test_crossings_at_the_ends_of_steps_are_those_that_events_find():
+    """Levels that grid states take to the last bit, those at the ends of chunks among them.
+
+    Not the last state of the run: rounding decides whether a run that ends on the plane has reached it.
+    """
+    run = solve(HH, "kahan_li8", (0, 60), dt=0.1)
+    for k in (*range(1, 600, 97), 55, 255, 256, 257):
+        level = float(run.y[0, k])
+        section = poincare_section(HH, "kahan_li8", (0, 60), level=level, direction=0, dt=0.1)
+        sol = solve(HH, "kahan_li8", (0, 60), dt=0.1, t_eval=[], events=lambda t, y, level=level: y[0] - level)
+        assert len(section) == len(sol.t_events[0])
+        np.testing.assert_allclose(section.t, sol.t_events[0], atol=1e-11)
+        assert np.abs(section.t - run.t[k]).min() < 1e-11
+
+
+def test_the_section_of_waves_is_the_standard_map():
+    """The half-kicked one of verlet, whose default step divides the period."""
+    K, n = 0.9, 20
+    section = poincare_section(KICKED, "verlet", (0, n))
+    q, p = section.states.T
+    kick = K / 2 * np.sin(q)
+    np.testing.assert_allclose(q[1:], q[:-1] + p[:-1] + kick[:-1], atol=1e-13)
+    np.testing.assert_allclose(p[1:] - kick[1:], p[:-1] + kick[:-1], atol=1e-13)
+    late = section.since(15)
+    assert late.t.tolist() == [15, 16, 17, 18, 19, 20]
+    assert len(poincare_section(KICKED, "verlet", (0, n), dt=0.3).states) == n + 1  # steps of ¼
+
+
+def test_a_plane_in_a_driven_system_is_crossed_at_the_times_that_events_find():
+    def g(t, y):
+        return y[0]
+
+    g.direction = 1
+    section = poincare_section(DUFFING, "kahan_li8", (0.3, 60), coordinate="q", dt=0.2)
+    sol = solve(DUFFING, "kahan_li8", (0.3, 60), t_eval=[], events=g, dt=0.2)
+    assert len(section) == len(sol.t_events[0]) > 1
+    np.testing.assert_allclose(section.t, sol.t_events[0], atol=1e-12)
+    np.testing.assert_allclose(section.states, sol.y_events[0], atol=1e-12)

@@ -1,11 +1,14 @@
 """work_precision(): sweeps, references, and what is read off the diagram."""
 
 import csv
+import math
 
 import numpy as np
 import pytest
 
-from sympflow import HamiltonianSystem, SympFlow, get, systems, work_precision
+from sympflow import HamiltonianSystem, SympFlow, compare, get, systems, work_precision
+from sympflow.studies.attempts import Row
+from sympflow.studies.precision import break_even
 
 pytestmark = pytest.mark.filterwarnings("ignore:`dt` .* is too long:RuntimeWarning")
 
@@ -104,3 +107,48 @@ def test_a_driven_system_is_judged_by_its_energy_balance_and_a_damped_one_by_its
     assert verlet[0].error / verlet[1].error == pytest.approx(4, rel=0.1)
     assert verlet[0].balance_error is verlet[0].energy_error is None
     assert damped.rows[-1].status == "not applicable"
+
+
+@pytest.mark.parametrize(("label", "order"), [("verlet", 2), ("kahan_li8", 8)])
+@pytest.mark.parametrize("trajectories", [1, 20])
+def test_errors_fall_with_the_order(report, label, order, trajectories):
+    rows = [r for r in points(report, label, trajectories) if r.status == "ok" and r.dt < 0.5]
+    slope = np.polyfit(np.log([r.dt for r in rows]), np.log([r.error for r in rows]), 1)[0]
+    assert slope == pytest.approx(order, abs=0.6)
+
+
+def test_evaluations_are_those_of_one_trajectory(report):
+    for trajectories in (1, 20):
+        row = next(r for r in points(report, "verlet", trajectories) if r.dt == 0.05)
+        assert row.force_evaluations == 200 + 10  # an output closes a step that was merged with the next
+        assert row.hessian_evaluations == 0
+    alone, batch = points(report, "rk45")[0], points(report, "rk45", 20)[0]
+    assert batch.force_evaluations == pytest.approx(alone.force_evaluations, rel=0.3)
+    assert "Timed on 4 trajectories" in batch.reason
+
+
+def test_an_error_that_would_be_small_by_chance_is_measured():
+    """At dt·ω = 2 Verlet turns an oscillator at rest by half a turn: all its steps have its energy but for rounding."""
+    few = {"t_span": (0, 20 / 1.3), "y0": [1.0, 0.0], "n_outputs": 10, "repeats": 1}
+    rows = work_precision(systems.harmonic_oscillator(1.3), ["verlet"], steps=[2 / 1.3, 0.4, 0.1], **few).rows
+    assert [row.dt for row in rows] == [2 / 1.3, 0.4, 0.1]
+    assert 1e-3 < rows[2].energy_error < rows[1].energy_error < rows[0].energy_error
+
+
+def test_a_flow_in_another_time_is_a_point_as_it_is_a_row_of_compare():
+    flow = get("sympflow")(flow="kepler-log-1")
+    few = {"t_span": (0, 20), "n_outputs": 20, "repeats": 1}
+    verlet, point = work_precision(systems.kepler(0.6), ["verlet", flow], steps=[0.05], **few).rows
+    (row,) = compare(systems.kepler(0.6), [flow], ["error", "energy"], dt=0.05, **few).rows
+    assert (point.label, point.status, point.dt) == ("sympflow", "uncertain", row.dt)  # better than the reference
+    assert point.training_time == row.training_time > 0
+    assert point.energy_error == row.energy_error < 1e-6 * verlet.energy_error
+
+
+def test_training_has_paid_for_itself_when_the_time_saved_is_that_of_training():
+    rival = [Row("s", "verlet", "verlet", energy_error=e, run_time=0.01 / e) for e in (1e-2, 1e-4)]
+    flow = Row("s", "sympflow", "sympflow", energy_error=1e-3, run_time=4.0, training_time=60.0)
+    slow = Row("s", "sympflow", "slow", energy_error=1e-3, run_time=40.0, training_time=60.0)
+    *_, quick, never = break_even([*rival, flow, slow], length=100.0)
+    assert quick.break_even == pytest.approx(60 / ((10 - 4) / 100))
+    assert never.break_even == math.inf

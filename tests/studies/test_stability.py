@@ -1,6 +1,7 @@
 """stability(): the limits that are known, blow-ups told apart, and what is refused."""
 
 import json
+import math
 import re
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 import torch
 
 import sympflow
-from sympflow import HamiltonianSystem, solve, stability, systems
+from sympflow import HamiltonianSystem, max_energy_error, solve, stability, systems
 from sympflow.studies.step_stability import blow_up
 
 pytestmark = pytest.mark.filterwarnings("ignore:`dt` .* is too long:RuntimeWarning")
@@ -199,3 +200,79 @@ def test_json_holds_the_rows_and_the_limits(tmp_path):
     assert [row["status"] for row in content["rows"]] == ["stable", "unstable"]
     assert content["rows"][1]["energy_error"] == "inf"
     assert content["limits"][0]["stable"] == report.limits[0].stable
+
+
+@pytest.mark.parametrize(
+    "method", ["srkn6b", *(pytest.param(m, marks=pytest.mark.slow) for m in ("kahan_li8", "gauss_legendre4"))]
+)
+def test_the_limit_of_a_nonlinear_system_does_not_depend_on_the_steps(method):
+    few = {"metrics": ("energy",), "max_steps": 5000, "min_steps": 200, "t_span": (0.0, 20.0)}
+    limits = {
+        stability(systems.henon_heiles(), [method], steps=steps, **few).limits[0].stable
+        for steps in ([0.05], [0.31, 0.32], [0.06, 7.0])
+    }
+    assert len(limits) == 1
+
+
+def test_windows_below_the_limit_are_named_where_the_runs_bear_them():
+    """Near its equilibrium the pendulum grows by kahan_li8 at dt = 3.12, to 1e2 times its energy and no more."""
+    few = {"steps": [0.5], "metrics": ("energy",), "max_steps": 5000, "min_steps": 500}
+    (limit,) = stability(systems.pendulum(), ["kahan_li8"], y0=[0.01, 0.01], **few).limits
+    assert limit.stable > 4
+    assert limit.linear == pytest.approx(3.0964, abs=1e-4)
+    assert limit.reached == "below the bound, though small oscillations grow at 3.0964 to 3.1402"
+
+
+def test_two_is_unstable_though_one_state_does_not_show_it():
+    oscillator = systems.harmonic_oscillator()
+    alone = solve(oscillator, "verlet", (0.0, 2e3), dt=2.0)
+    assert sympflow.max_energy_error(alone) == 0
+    kinds = {}
+    for z in (1.98, 2.0, 2.02):
+        report = stability(oscillator, ["verlet"], steps=[z], metrics=("energy",), limits=False)
+        kinds[z] = report.rows[0].status
+    assert kinds == {1.98: "bounded", 2.0: "unstable", 2.02: "unstable"}
+
+
+@pytest.mark.parametrize(
+    ("method", "options"), [("verlet", {"dt": 0.5}), ("implicit_midpoint", {"dt": 0.5}), ("rk45", {}), ("dop853", {})]
+)
+def test_a_singularity_is_found_whatever_the_step_or_the_tolerance(method, options):
+    system = systems.henon_heiles_escape()
+    end = blow_up(solve(system, method, (0.0, 20.0), on_domain_exit="ignore", **options))
+    assert end.singular
+    assert abs(end.time - SINGULARITY) < 1e-8
+    assert "grows" not in str(end)
+
+
+def test_an_escape_after_a_long_run_is_that_of_the_orbit_that_ran():
+    """Too far for the solution from y0: it is followed from a state that the run has stored, or reaches once more."""
+    system = systems.henon_heiles_escape(1 / 6 + 1e-3)
+    # Orbits near a chaotic one: when each of them escapes depends on the rounding, that some do so late does not.
+    y0 = np.array([0.138, 0.04, 0.554, -0.076]) * (1 + 1e-6 * np.arange(16)[:, None])
+    for options in ({}, {"t_eval": [1e4]}):
+        sol = solve(system, "kahan_li8", (0, 1e4), y0, dt=0.1, **options)
+        late = sol.stats["failed_at"] > 1000
+        assert late.any()
+        assert np.abs(sol.stats["blow_up_time"] - sol.stats["failed_at"])[late].max() < 2 * 0.1
+    for options in ({"t_eval": [1e4]}, {"save_every": 999}):
+        runs = (solve(system, "kahan_li8", (0, 1e4), start, dt=0.1, **options) for start in y0)
+        stats = next(sol.stats for sol in runs if sol.stats.get("failed_at", 0) > 1000)
+        assert abs(stats["blow_up_time"] - stats["failed_at"]) < 2 * 0.1
+
+
+def test_an_energy_error_above_one_is_bounded_rather_than_stable():
+    oscillator = systems.harmonic_oscillator()
+    (row,) = stability(oscillator, ["leapfrog"], steps=[1.99], metrics=("energy",), limits=False).rows
+    assert row.status == "bounded"
+    assert row.energy_error > 1  # (z²/4)/(1 − z²/4) is 99
+    assert "but reaches" in row.reason
+
+
+def test_the_bound_is_missed_where_the_orbit_of_the_map_has_a_short_period():
+    """Verlet's step turns the oscillator by θ, cos θ = 1 − z²/2: for θ = 2π/n the error is max_k sin²(kθ)·z²/4."""
+    for n in (3, 5, 6, 7, 8):
+        z = 2 * math.sin(math.pi / n)
+        sol = solve(systems.harmonic_oscillator(), "verlet", (0.0, 100 * n * z), [1.0, 0.0], dt=z)
+        share = max(math.sin(2 * math.pi * k / n) ** 2 for k in range(n))
+        assert max_energy_error(sol) == pytest.approx(share * z**2 / 4, rel=1e-10)

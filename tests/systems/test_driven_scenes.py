@@ -1,13 +1,15 @@
 """The driven scenes: the truths that their docstrings tell."""
 
 import math
+import warnings
 
 import numpy as np
 import pytest
+import sympy as sp
 from conftest import refusals
 from scipy.special import mathieu_a, mathieu_b, mathieu_cem
 
-from sympflow import floquet_multipliers, solve, systems
+from sympflow import HamiltonianSystem, energy_balance_error, floquet_multipliers, solve, systems
 from sympflow.hamiltonian.domain import domain_from_dict
 
 SCENES = {name: systems.get(name)() for name in ("driven-pendulum", "paul-trap", "duffing", "fodo-cell", "kicked")}
@@ -89,3 +91,73 @@ def test_a_periodic_orbit_of_the_paul_trap_is_a_mathieu_function():
     exact = mathieu_cem(0, q, np.degrees(t))[0]
     sol = solve(system, "kahan_li8", (0, 10), [exact[0], 0, 0, 0], t_eval=t, backend="array")
     np.testing.assert_allclose(sol.y[0], exact, atol=1e-12)
+
+
+def test_the_paul_trap_holds_the_ion_up_to_the_first_boundary():
+    """q = 0.9080463337 at a = 0, where b₁(q) = 0, by bisection; the tip of the region where both planes are stable."""
+    trap, low, high = SCENES["paul-trap"], 0.9, 0.92
+    while high - low > 1e-5:
+        q = (low + high) / 2
+        stable = floquet_multipliers(trap.with_params(drive=q), np.zeros(4)).stable
+        low, high = (q, high) if stable else (low, q)
+    assert low == pytest.approx(0.9080463337, abs=2e-5)
+    assert mathieu_b(1, 0.9080463337) == pytest.approx(0.0, abs=1e-9)
+    for a, stable in ((0.2365, True), (0.2375, False)):
+        assert floquet_multipliers(systems.paul_trap(a, 0.7060), np.zeros(4)).stable is stable
+
+
+def test_the_multipliers_of_duffings_oscillator_have_the_product_of_the_friction():
+    """An orbit of the period of the drive, found by Newton's method, by 60 steps a period."""
+    system, y = SCENES["duffing"], np.array([-0.148, 0.018])  # of the linear equation
+    T, dt = system.period, system.period / 60
+    for _ in range(8):
+        end = solve(system, "kahan_li8", (0, T), y, dt=dt, t_eval=[T], backend="array").y[:, -1]
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # not periodic yet
+            M = floquet_multipliers(system, y, dt=dt).monodromy
+        y = y - np.linalg.solve(M - np.eye(2), end - y)
+    found = floquet_multipliers(system, y, dt=dt)
+    assert found.mismatch < 1e-10
+    assert not found.stable  # it is part of the strange attractor
+    assert np.prod(found.multipliers).real == pytest.approx(math.exp(-0.25 * T), rel=1e-10)
+    assert found.pairing < 1e-13
+    assert systems.duffing(damping=0).conservative
+
+
+@pytest.mark.parametrize(("method", "order"), [("leapfrog", 2), ("chin4c", 4), ("gauss_legendre4", 4), ("verlet", 2)])
+def test_order_in_a_lattice_whose_steps_meet_the_jumps(method, order):
+    system, exact = SCENES["fodo-cell"], systems.fodo_matrices()
+    errors = [np.abs(cell(system, method, dt=system.dt / n) - exact).max() for n in (1, 2)]
+    assert math.log2(errors[0] / errors[1]) == pytest.approx(order, abs=0.1)
+
+
+def test_runs_land_on_jumps_within_their_steps():
+    cell = SCENES["fodo-cell"]
+    t = sp.Symbol("t", real=True)
+
+    def system(drive, **scene):
+        q, p = sp.symbols("q p", real=True)
+        return HamiltonianSystem.from_sympy(p**2 / 2 + q**2 / 2 - q * drive, time="t", y0=[0.5, 0.1], **scene)
+
+    switched = system(sp.Piecewise((0, t < 1.2), (1, True)))
+    waves = system(sp.sign(sp.cos(t)))
+    ramp = system((t - 1.2) * sp.Heaviside(t - 1.2))
+    for each, t0, dt in (
+        (cell, 0.0, 0.2),
+        (cell, 0.06, cell.dt),
+        (switched, 0.0, 0.3),
+        (switched, 0.2, 0.25),
+        (waves, 0.0, 0.1),
+        (waves, 2.0, -0.1),
+        (waves, -math.pi / 2, math.pi / 14),
+    ):
+        span = t0, t0 + math.copysign(2.0, dt)
+        found, finer = (
+            solve(each, "gauss_legendre8", span, dt=h, t_eval=[span[1]], backend="array").y
+            for h in (abs(dt), abs(dt) / 2)
+        )
+        np.testing.assert_allclose(found, finer, rtol=1e-8)
+    solve(ramp, "kahan_li8", (0.0, 2.0), dt=0.5, backend="array")  # of a kink there is no word
+    with pytest.raises(ValueError, match="jumps at some times"):
+        energy_balance_error(solve(switched, "leapfrog", (0, 2), dt=0.4, backend="array"))
+    solve(switched, "dop853", (0.0, 2.0))  # its steps are its own

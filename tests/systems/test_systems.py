@@ -1,6 +1,7 @@
 """The built-in scenes: each is what its docstring says, and the truths that are known of it hold."""
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from conftest import refusals
 
 from sympflow import max_energy_error, solve, systems
 from sympflow.hamiltonian.domain import domain_from_dict
+from sympflow.systems import SYSTEMS, celestial, chains
 
 # a scene as it is built, and H(y0) worked out by hand
 SCENES = {
@@ -205,3 +207,180 @@ def test_a_charged_particle_gyrates_and_is_reflected():
     assert system.domain.contains(sol.states).all()
     with pytest.raises(ValueError, match=r"^`system` must be charged_particle"):
         systems.magnetic_moment(systems.quartic(), np.zeros(4))
+
+
+@pytest.mark.parametrize("e", [0.2, 0.6, 0.95])
+def test_the_kepler_ellipse_is_the_orbit(e):
+    """J∇H along it is dy/dE ÷ dt/dE, t = E − e sin E; angular momentum √(1 − e²)."""
+    system, E = systems.kepler(e), np.linspace(0.1, 6, 7)
+    y = systems.kepler_ellipse(e, E)
+    step = 1e-6
+    dy = (systems.kepler_ellipse(e, E + step) - systems.kepler_ellipse(e, E - step)) / (2 * step)
+    field = system.vector_field(y)
+    np.testing.assert_allclose(dy / (1 - e * np.cos(E))[:, None], field, rtol=1e-6, atol=1e-6 * abs(field).max())
+    np.testing.assert_allclose(y[:, 0] * y[:, 3] - y[:, 1] * y[:, 2], math.sqrt(1 - e * e), rtol=1e-12)
+    np.testing.assert_allclose(systems.kepler_ellipse(e, np.array(0.0)), system.y0, atol=1e-12)
+
+
+def test_on_the_separatrix_of_the_double_well():
+    system = systems.double_well()
+    t = np.linspace(0, 8, 33)
+    sol = solve(system, "dop853", (0, 8), t_eval=t, rtol=1e-13, atol=1e-14)
+    exact = math.sqrt(2) / np.cosh(t) * np.array([np.ones(33), -np.tanh(t)])
+    np.testing.assert_allclose(sol.y, exact, atol=1e-14 * math.exp(8) * 10)  # errors grow with exp(t)
+    right = solve(systems.double_well(0.2), "verlet", (0, 50), backend="array")
+    assert right.y[0].min() > 0
+
+
+def test_on_the_separatrix_of_the_pendulum():
+    t = np.linspace(0, 8, 33)
+    sol = solve(systems.pendulum_separatrix(), "dop853", (0, 8), t_eval=t, rtol=1e-13, atol=1e-14)
+    np.testing.assert_allclose(sol.y, [4 * np.arctan(np.exp(t)) - np.pi, 2 / np.cosh(t)], atol=1e-13 * math.exp(8))
+    below, above = (solve(systems.pendulum_separatrix(E), "kahan_li8", (0, 50)).y[0] for E in (1.99, 2.01))
+    assert abs(below).max() < math.pi
+    assert above[-1] > 4 * math.pi
+
+
+def test_henon_heiles_ends_in_finite_time_above_the_escape_energy():
+    from scipy.integrate import quad
+
+    p, E = 0.7, 0.245
+    # q = tan²(s) maps [0, π/2) to [0, ∞) and makes the integrand smooth
+    t_star, _ = quad(
+        lambda s: 2 * math.tan(s) / math.cos(s) ** 2 / math.sqrt(2 * E - math.tan(s) ** 4 + 2 * math.tan(s) ** 6 / 3),
+        0,
+        math.pi / 2 - 1e-9,
+        epsabs=1e-13,
+        epsrel=1e-13,
+        limit=200,
+    )
+    assert t_star == pytest.approx(5.450984210235402, abs=1e-8)
+    system = systems.henon_heiles_escape(E)
+    np.testing.assert_array_equal(system.y0, [0, 0, 0, p])
+    sol = solve(system, "dop853", (0, t_star - 0.01), rtol=1e-13, atol=1e-13)
+    assert sol.y[1, -1] == pytest.approx(6 / 0.01**2, rel=1e-3)
+    beyond = solve(system, "dop853", (0, 10), rtol=1e-12, atol=1e-12)
+    assert beyond.status == -1
+    assert beyond.t[-1] == pytest.approx(t_star, abs=1e-6)
+
+
+def test_henon_heiles_stays_in_the_well_below_the_escape_energy():
+    system = systems.henon_heiles_escape(0.16567)
+    sol = solve(system, "kahan_li8", (0, 1000), dt=0.1)
+    assert system.domain.contains(sol.states, slack=1e-9).all()
+
+
+def test_the_toda_lattice_of_three_is_henon_heiles_to_third_order():
+    """With differences (2q₂ + 2√3q₁, 2q₂ − 2√3q₁, −4q₂) of neighbours, V/24 is the potential of Hénon and Heiles."""
+    toda, hh = systems.toda_lattice(3), systems.henon_heiles()
+    x = np.random.default_rng(0).uniform(-1, 1, (50, 2))
+    worst = []
+    for size in (2e-2, 1e-2):
+        q1, q2 = size * x.T
+        second = 2 * q2 - 2 * math.sqrt(3) * q1  # with the third particle at 0
+        particles = np.stack([second + 2 * q2 + 2 * math.sqrt(3) * q1, second, 0 * q1], axis=-1)
+        worst.append(abs(toda.potential(particles) / 24 - hh.potential(size * x)).max())
+    assert worst[0] / worst[1] == pytest.approx(16, rel=0.2)  # what is left is of fourth order
+
+
+def test_the_pythagorean_bodies_meet_as_they_should():
+    """The closest approach, at t = 15.8299."""
+    sol = solve(systems.three_body(), "dop853", (0, 16), rtol=1e-13, atol=1e-14)
+    bodies = sol.states[:, :6].reshape(-1, 3, 2)
+    distances = [np.linalg.norm(bodies[:, i] - bodies[:, j], axis=1) for i, j in ((0, 1), (0, 2), (1, 2))]
+    distance = np.min(distances, axis=0)
+    assert distance.min() == pytest.approx(4.14e-4, rel=0.01)
+    assert sol.t[distance.argmin()] == pytest.approx(15.8299, abs=2e-4)
+
+
+PLANETS, ARGON = systems.outer_solar_system(), systems.lennard_jones()  # what is compiled belongs to the system
+
+
+def test_bodies_keep_their_momenta():
+    for system, dimension, mass in (
+        (systems.three_body(), 2, np.array([3.0, 4, 5])),
+        (PLANETS, 3, celestial.PLANET_MASSES),
+        (ARGON, 2, np.full(7, chains.MASS)),
+    ):
+        backend = "array" if system.symbols else "compiled"
+        sol = solve(system, "kahan_li8", (0, 400 * system.dt), save_every=20, backend=backend)
+        q, p = (x.reshape(len(sol.t), -1, dimension) for x in np.split(sol.states, 2, axis=-1))
+        scale = abs(p).max()
+        np.testing.assert_allclose(p.sum(1), p[:1].sum(1) + np.zeros((len(sol.t), 1)), atol=1e-12 * scale)
+        assert abs(p[0].sum(0)).max() < 1e-14 * scale
+        angular = np.cross(q, p).sum(1) if dimension == 3 else (q[..., 0] * p[..., 1] - q[..., 1] * p[..., 0]).sum(1)
+        np.testing.assert_allclose(angular, angular[:1] + np.zeros_like(angular), atol=1e-11 * scale * abs(q).max())
+        np.testing.assert_allclose(system.velocity(p.reshape(len(p), -1)), (p / mass[:, None]).reshape(len(p), -1))
+
+
+def test_the_outer_solar_system_is_that_of_the_book():
+    system = systems.outer_solar_system()
+    m, G = celestial.PLANET_MASSES, celestial.G
+    q, p = (x.reshape(6, 3) for x in np.split(system.y0, 2))
+    v = p / m[:, None]
+    np.testing.assert_allclose(q - q[0], celestial.POSITIONS, atol=1e-14)
+    np.testing.assert_allclose(v - v[0], celestial.VELOCITIES, atol=1e-17)
+    # osculating elements about the Sun: semi-major axes in AU, periods in days
+    r, speed2 = np.linalg.norm(q[1:] - q[0], axis=1), ((v[1:] - v[0]) ** 2).sum(1)
+    mu = G * (m[0] + m[1:])
+    a = 1 / (2 / r - speed2 / mu)
+    period = 2 * math.pi * np.sqrt(a**3 / mu)
+    np.testing.assert_allclose(a, [5.20, 9.58, 19.2, 30.1, 39.5], rtol=0.02)
+    assert period[0] == pytest.approx(4332, rel=2e-3)
+    # Kepler's third law with the year: k = 0.01720209895, G = k² in solar masses
+    assert math.sqrt(G) == pytest.approx(0.01720209895, rel=1e-9)
+
+
+def test_jupiter_returns_after_4332_days():
+    """Its mean period over 16 revolutions, from the angle swept in the plane of its orbit."""
+    system = PLANETS
+    sol = solve(system, "kahan_li8", (0, 16 * 4332.0), dt=50.0)
+    assert max_energy_error(sol) < 1e-13
+    assert sol.stats["backend"] == "compiled"
+    q = (sol.states[:, 3:6] - sol.states[:, :3]).T
+    pole = np.cross(q[:, 0], q[:, 20])
+    pole /= np.linalg.norm(pole)
+    x = q[:, 0] / np.linalg.norm(q[:, 0])
+    angle = np.unwrap(np.arctan2(np.cross(pole, x) @ q, x @ q))
+    assert 2 * math.pi * sol.t[-1] / angle[-1] == pytest.approx(4332, rel=2e-3)
+    assert system.domain.contains(sol.states).all()
+
+
+def test_small_oscillations_of_the_double_pendulum():
+    """Their frequencies √(2 ± √2), and the second angle ∓√2 times the first."""
+    system = systems.double_pendulum()
+    J = np.kron([[0, 1], [-1, 0]], np.eye(2))
+    rates, modes = np.linalg.eig(J @ system.hessian(np.zeros(4)))
+    order = np.argsort(rates.imag)[2:]
+    np.testing.assert_allclose(rates.imag[order], [math.sqrt(2 - math.sqrt(2)), math.sqrt(2 + math.sqrt(2))])
+    np.testing.assert_allclose(modes[1, order] / modes[0, order], [math.sqrt(2), -math.sqrt(2)], atol=1e-12)
+    assert system.hamiltonian(np.zeros(4)) == -3
+
+
+@pytest.mark.parametrize(("semilatus", "e"), [(12.0, 0.5), (7.5, 0.7), (1000.0, 0.2)])
+def test_the_perihelion_of_the_schwarzschild_orbit_advances(semilatus, e):
+    """By the elliptic integral of its own quadrature, dφ/dχ = √(ℓ/(ℓ − 6 − 2e cos χ)); far out by 6π/ℓ."""
+    from scipy.integrate import quad
+
+    angle = systems.perihelion_angle(semilatus, e)
+    quadrature, _ = quad(
+        lambda x: math.sqrt(semilatus / (semilatus - 6 - 2 * e * math.cos(x))), 0, 2 * math.pi, epsabs=1e-13
+    )
+    assert angle == pytest.approx(quadrature, rel=1e-12)
+    if semilatus == 1000:
+        assert angle - 2 * math.pi == pytest.approx(6 * math.pi / semilatus, rel=0.02)
+    system = systems.schwarzschild(semilatus, e)
+    sol = solve(system, "dop853", (0, system.t_span[1] / 5), events=lambda t, y: y[2], rtol=1e-12, atol=1e-12)
+    r, phi = sol.y_events[0][:, :2].T  # p_r = 0 at either end of the orbit, from the first perihelion on
+    np.testing.assert_allclose(r[:4], np.array([1 / (1 + e), 1 / (1 - e)] * 2)[:4] * semilatus, rtol=1e-8)
+    np.testing.assert_allclose(np.diff(phi[:4]), angle / 2, rtol=1e-8)
+    assert system.domain.contains(sol.states, slack=1e-9).all()
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_every_scene_is_documented(name):
+    docs = Path(__file__).parents[2] / "docs"
+    assert f"| `{name}` |" in (docs / "systems.md").read_text(encoding="utf-8")
+    assert f"::: sympflow.systems.{SYSTEMS[name].__name__}\n" in (docs / "reference" / "systems.md").read_text(
+        encoding="utf-8"
+    )

@@ -72,3 +72,36 @@ def test_the_schroedinger_soliton_goes_around_the_ring():
     ring = sympflow.systems.nonlinear_schroedinger(velocity=3.0, n=256, length=40.0)
     sol = solve(ring, "linear_kahan_li8", (0, 20), dt=0.02, t_eval=[0.0, 10.0, 20.0])  # one turn and a half
     assert abs(sol.states - ring.exact(sol.t)).max() < 1e-7
+
+
+@pytest.mark.parametrize("chain", CHAINS)
+def test_the_solution_of_a_chain_is_exact(chain):
+    system = CHAINS[chain]()
+    times = np.linspace(*system.t_span, 9)
+    rounding = 10 * np.finfo(float).eps * system.t_span[1] / 1e-4  # of the phase, in a difference over 1e-4
+    assert max(residual(system, t) for t in times[1:-1]) < rounding
+    np.testing.assert_array_equal(system.exact(0.0), system.y0)
+    energies = system.hamiltonian(system.exact(times))
+    np.testing.assert_allclose(energies, energies[0], rtol=1e-12)
+    assert system.domain.contains(system.exact(times)).all()
+
+
+def test_grid_and_method_converge_together_to_a_moving_kink():
+    """The wave of the line: halved are h and dt, of order 4 both."""
+    errors = []
+    for n in (160, 320):
+        system = systems.sine_gordon("kink", velocity=0.5, n=n, length=50.0)
+        sol = solve(system, "srkn6b", (0.0, 8.0), dt=32 / n, t_eval=[8.0], backend="array")
+        errors.append(abs(sol.y[:, -1] - system.exact(8.0)).max())
+    assert math.log2(errors[0] / errors[1]) == pytest.approx(4, abs=0.4)
+
+
+def test_a_small_soliton_of_a_chain_is_that_of_korteweg_and_de_vries():
+    """r = −κ² sech²(κ(i − i₀ − (1 + κ²/6)t)), up to O(κ⁴)."""
+    defects = []
+    for kappa in (0.2, 0.1):
+        chain, t = systems.toda_chain(400, kappa), 12.0
+        r = np.diff(chain.exact(t)[:400])
+        x = systems.grid(chain)[:-1] + 100 - (1 + kappa**2 / 6) * t
+        defects.append(abs(r + kappa**2 / np.cosh(kappa * x) ** 2).max())
+    assert math.log2(defects[0] / defects[1]) > 3.7

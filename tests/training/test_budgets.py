@@ -2,15 +2,18 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 
-from sympflow import Box, SympFlow, systems, train
+from sympflow import Box, HamiltonianSystem, SympFlow, systems, train
+from sympflow.flow.primed import PrimedFlow
 from sympflow.hamiltonian.hamiltonian import Hamiltonian
-from sympflow.training import trials
+from sympflow.training import starts, trials
+from sympflow.training.least_squares import STOPPED, levenberg_marquardt
 from sympflow.training.points import Labels
 from sympflow.training.session import LEAST_PART, OutOfTime, Session
-from sympflow.training.table_fit import TableFit
+from sympflow.training.table_fit import TableFit, TableRun
 
 HH, PENDULUM = systems.henon_heiles(), systems.pendulum()
 FLOW = SympFlow.primed(PENDULUM, 2, dt=0.5, processor=2)
@@ -128,3 +131,101 @@ def test_a_domain_whose_squares_overflow_is_refused():
 
 
 # what a flow is worth -----------------------------------------------------------------------------------------
+
+
+def test_least_squares_that_are_cut_keep_what_they_have():
+    calls = []
+
+    def residuals(x):
+        calls.append(x)
+        if len(calls) > 7:
+            raise OutOfTime
+        return np.array([10 * (x[1] - x[0] ** 2), 1 - x[0]])
+
+    def linearized(x):
+        return np.array([10 * (x[1] - x[0] ** 2), 1 - x[0]]), np.array([[-20 * x[0], 10.0], [-1.0, 0.0]])
+
+    found = levenberg_marquardt(residuals, linearized, np.array([-1.2, 1.0]))
+    assert found.reason == STOPPED
+    assert found.cost < 24.2
+    assert found.iterations >= 1
+
+
+def test_many_degrees_of_freedom_are_fitted():
+    """A chain of twenty, given by a gradient and its products."""
+    d = 20
+
+    def bonds(q):
+        zero = np.zeros((*q.shape[:-1], 1))
+        return np.diff(np.concatenate([zero, q, zero], axis=-1), axis=-1)
+
+    chain = HamiltonianSystem(
+        lambda q: (bonds(q) ** 2 / 2 + bonds(q) ** 4 / 16).sum(-1),
+        gradient=lambda q: -np.diff(bonds(q) + bonds(q) ** 3 / 4, axis=-1),
+        hessian_vector=lambda q, v: -np.diff((1 + 0.75 * bonds(q) ** 2) * bonds(v), axis=-1),
+        ndof=d,
+        domain=Box([-1.0] * 2 * d, [1.0] * 2 * d),
+    )
+    omega = starts.frequency(chain, chain.domain)
+    q = chain.domain.sample(starts.FEWER_SAMPLES, starts.SEED)[:, :d]
+    exact = np.sqrt(np.linalg.eigvalsh(chain.potential_hessian(q)).max(-1))
+    assert omega == pytest.approx(np.quantile(exact, starts.QUANTILE), rel=0.05)
+    flow = SympFlow.primed(chain, 2, dt=0.25)
+    few = {"restarts": 1, "steps": 8, "points": 4, "reference_states": 4, "label_times": 2, "progress": False}
+    assert train(chain, flow=flow, **few).figures["missed_share"] < 1e-3
+
+
+class Began(Exception):
+    pass
+
+
+def array(q):
+    """Numbers of NumPy alone, so that the functions below are not traced."""
+    return np.asarray(q, dtype=float)
+
+
+def pendulum_by(what):
+    arguments = {"ndof": 1, "domain": PENDULUM.domain}
+    if what == "torch":
+        return HamiltonianSystem(lambda q: (1 - torch.cos(q)).sum(-1), **arguments)
+
+    def V(q):
+        return (1 - np.cos(array(q))).sum(-1)
+
+    def gradient(q):
+        return np.sin(array(q))
+
+    if what == "a gradient alone":
+        return HamiltonianSystem(V, gradient=gradient, **arguments)
+    return HamiltonianSystem(V, gradient=gradient, hessian_vector=lambda q, v: np.cos(array(q)) * v, **arguments)
+
+
+@pytest.mark.parametrize("what", ["torch", "a gradient alone", "NumPy"])
+def test_functions_are_primed_by_default(monkeypatch, what):
+    """A gradient alone has no force gradients."""
+    few = {"points": 5, "label_times": 1, "reference_states": 2, "progress": False}
+
+    def began(self, session):
+        raise Began(self.flow)
+
+    monkeypatch.setattr(TableRun, "go", began)
+    with pytest.raises(Began) as run:
+        train(pendulum_by(what), **few)
+    flow = run.value.args[0]
+    assert isinstance(flow, PrimedFlow)
+    assert (flow.gradients is None) == (what == "a gradient alone")
+    assert flow.dt == starts.default_primed(PENDULUM).dt
+
+
+def test_a_network_that_is_no_better_than_a_verlet_step_comes_with_a_warning():
+    with pytest.warns(UserWarning, match=r"far from .*, no better than one Verlet step .* kind='primed' is far better"):
+        flow = train(PENDULUM, steps=2, **NETWORK)
+    assert flow.figures["missed_share"] > flow.figures["verlet_missed_share"] > 0
+    x = torch.as_tensor(PENDULUM.domain.sample(50, 1))
+    q, p = x.chunk(2, -1)
+    q = q + p / 2
+    p = p - torch.sin(q)
+    exact = train(PENDULUM, 1.0, stages=4, restarts=1, steps=60, points=60, reference_states=20, progress=False)
+    y = exact(1.0, x)
+    verlet = (torch.cat([q + p / 2, p], -1) - y).norm(dim=-1).mean() / (y - x).norm(dim=-1).mean()
+    assert flow.figures["verlet_missed_share"] == pytest.approx(float(verlet), rel=0.5)

@@ -6,7 +6,7 @@ import warnings
 import numpy as np
 import pytest
 
-from sympflow import Box, HamiltonianSystem, systems
+from sympflow import Box, EnergySublevel, HamiltonianSystem, systems, train
 from sympflow.training.points import Labels
 from sympflow.training.session import OutOfTime, Session
 from sympflow.training.starts import frequency, warn_of_domain
@@ -58,3 +58,29 @@ def test_labels_that_are_late_name_the_part_of_the_domain_that_is_fast():
         Labels.of(system, x, np.array([0.5]), Session(time_budget=1e-9).deadline)
     lower, _ = re.findall(r"\[([^]]+)\]", str(late.value))
     assert -3.0 < float(lower.split(",")[0]) < -2.0
+
+
+def test_a_wall_that_orbits_come_to_is_no_part_to_leave_out():
+    """A ball falls on exp(−20 q): where it falls freely nothing oscillates, but it comes back to the wall."""
+    system = HamiltonianSystem.from_sympy("p**2/2 + exp(-20*q) + q", domain=Box([-0.3, -2], [3, 2]))
+    with pytest.warns(UserWarning, match="no smaller box holds them") as found:
+        warn_of_domain(system, system.domain)
+    dt, energy, low, high = re.search(
+        r": (\S+) in EnergySublevel\((\S+), Box\(\[(.+)\], \[(.+)\]\)\)", str(found[0].message)
+    ).groups()
+    corners = [[float(x) for x in corner.split(",")] for corner in (low, high)]
+    smaller = EnergySublevel(float(energy), Box(*corners), hamiltonian=system.hamiltonian)
+    assert 1.0 / frequency(system, smaller) == pytest.approx(float(dt), rel=0.2)
+    assert 2 * frequency(system, smaller) < frequency(system, system.domain)
+
+
+def test_states_whose_solutions_end_before_a_step_are_counted():
+    """Most orbits of H = p²/2 − q⁴/4 escape to infinity in a finite time; the others lie about the origin."""
+    system = HamiltonianSystem.from_sympy("p**2/2 - q**4/4", domain=Box([-1.6, -0.3], [1.6, 0.3]))
+    options = {"restarts": 2, "steps": 20, "points": 60, "reference_states": 50, "label_times": 2, "progress": False}
+    with pytest.warns(UserWarning, match=r"From \d+ of 50 held-out states|no solution exists up to") as found:
+        train(system, 1.2, **options)
+    (lower, upper) = (
+        [float(x) for x in corner.split(",")] for corner in re.findall(r"\[([^]]+)\]", str(found[0].message))[:2]
+    )
+    assert np.max(np.abs([lower[0], upper[0]])) < 1.6

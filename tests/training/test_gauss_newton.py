@@ -9,6 +9,7 @@ import torch
 import sympflow
 from sympflow import HamiltonianSystem, SympFlow, get, solve, systems, train
 from sympflow.flow.scaling import Scaling
+from sympflow.training import trainer
 from sympflow.training.fits import PrimedFit
 from sympflow.training.least_squares import levenberg_marquardt
 from sympflow.training.points import Labels, Stream, states
@@ -251,3 +252,77 @@ def test_the_fits_derivatives(options):
     table.assign(theta)
     executed = torch.stack([flow.psi(float(t), torch.as_tensor(LABELS.x)) for t in LABELS.t])
     np.testing.assert_allclose(r, errors_of(executed.numpy()), atol=1e-14)
+
+
+@pytest.mark.parametrize("system", [HH, PENDULUM], ids=["henon-heiles", "pendulum"])
+def test_labels_agree_with_another_method(system):
+    """DOP853 against Kahan–Li of order 8 with 400 tiny steps, whose truncation is below rounding."""
+    x, t = system.domain.sample(30, 0), np.array([0.5, 1.0])
+    other = solve(system, "kahan_li8", (0.0, 1.0), y0=x, dt=1 / 400, t_eval=t).y
+    np.testing.assert_allclose(Labels.of(system, x, t).y, np.moveaxis(other, -1, 0), atol=2e-13)
+
+
+def test_a_processor_pays():
+    """At every time, and at no cost over a long run."""
+    processed, plain = (
+        train(HH, flow=SympFlow.primed(HH, 2, processor=c), **{**QUICK, "steps": 40}).figures for c in (3, 0)
+    )
+    assert processed["one_step_error"] < plain["one_step_error"] / 5
+    assert processed["fractional_error"] < 10 * processed["one_step_error"]
+
+
+def test_residuals_of_a_loss_are_those_of_the_flow():
+    """The whole fit against Loss: the sum of squares is the loss, and the Jacobian its derivative."""
+    flow = SympFlow.primed(PENDULUM, 2, degree=3, processor=1)
+    config = PrimedFit(loss="residual+matching", residual_weight=2.0, matching_weight=3.0, loss_points=20)
+    run = TableRun(flow, PENDULUM, PENDULUM.domain, Scaling.unit(1), config)
+    theta = Table(flow).parameters() + np.random.default_rng(0).normal(0, 0.02, flow.n_parameters)
+    r = check_derivatives(run.whole, theta, 1e-8)
+    Table(flow).assign(theta)
+    objective = run.whole.objective
+    assert r @ r == pytest.approx(float(objective.loss(flow, objective.points).detach()), rel=1e-12)
+
+
+def weights(flow):
+    return torch.cat([w.reshape(-1) for w in flow.state_dict().values()])
+
+
+@pytest.mark.parametrize(("symbolic", "starts"), [(True, 72), (False, 24)])
+def test_nothing_said_means_the_same_flow_on_every_machine(monkeypatch, clock, symbolic, starts):
+    """However long its starts and labels take there, none is left out; only a budget that is given ends them."""
+    monkeypatch.setattr(trainer.trials, "can_try", lambda system: symbolic)
+    monkeypatch.setattr(trainer, "STARTS", 3)
+    monkeypatch.setattr(trainer, "SOME", 3)
+    few = {"points": 60, "reference_states": 20, "progress": False}
+    flows = [train(PENDULUM, **few)]
+    clock.costs_seconds(TableRun, "next_minimum", 1000.0)
+    clock.costs_seconds(Labels, "of", 1000.0)
+    flows.append(train(PENDULUM, **few))
+    one, other = (weights(flow) for flow in flows)
+    assert torch.equal(one, other)
+    assert flows[1].recipe["stages"] == flows[0].recipe["stages"]
+    assert clock.now > 3000.0
+    seen = []
+    monkeypatch.undo()
+    monkeypatch.setattr(trainer.trials, "can_try", lambda system: symbolic)
+    monkeypatch.setattr(TableRun, "go", lambda self, session: seen.append(self.planned) or 1 / 0)
+    for options in ({}, {"restarts": 5}, {"time_budget": 7.0}):
+        with pytest.raises(ZeroDivisionError):
+            train(PENDULUM, points=30, reference_states=5, dt=0.5, **options)
+    assert seen == [starts, 5, trainer.BOUGHT if symbolic else 24]
+
+
+def test_a_free_flow_is_no_worse_than_a_palindrome():
+    half, full = (
+        train(PENDULUM, flow=SympFlow.primed(PENDULUM, 2, palindromic=p), **QUICK).history[-1]["loss"]
+        for p in (True, False)
+    )
+    assert full < 1.05 * half
+
+
+def test_the_weight_at_dt_counts():
+    def errors(weight):
+        flow = SympFlow.primed(HH, 2, degree=1)  # one table for all t: a compromise
+        return train(HH, flow=flow, frozen_weight=weight, energy_weight=0.0, **QUICK).figures["one_step_error"]
+
+    assert errors(100.0) < errors(0.01)

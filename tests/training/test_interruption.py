@@ -1,8 +1,10 @@
 """Early ends of a search for a primed flow: Ctrl-C, at any moment, and a time budget, which counts all of it."""
 
+import math
 import os
 import signal
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +13,9 @@ import torch
 from sympflow import SympFlow, systems, train
 from sympflow.hamiltonian.exact_flow import reference_step
 from sympflow.training import checkpoint as checkpoints
+from sympflow.training import trials
 from sympflow.training.session import Interruption
+from sympflow.training.starts import default_primed
 from sympflow.training.table_fit import TableFit, TableRun
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="os.kill ends the process there")
@@ -113,3 +117,58 @@ def test_a_second_one_raises_and_the_checkpoint_stays(monkeypatch, tmp_path):
     with pytest.raises(KeyboardInterrupt):
         train(PENDULUM, flow=FLOW, checkpoint=path, **QUICK)
     assert checkpoints.read(path)["step"] == QUICK["restarts"]
+
+
+SHORT = {"STARTS": 2, "STEPS": 10, "FINAL_STEPS": 10, "POINTS": 20, "LENGTH": 10}
+
+
+def one_step_error(flow):
+    return flow.figures["one_step_error"]
+
+
+def short_trials(monkeypatch):
+    for name, value in SHORT.items():
+        monkeypatch.setattr(trials, name, value)
+    first, *_ = starts = [replace(default_primed(PENDULUM, phase=x), stages=2, processor=2) for x in (0.8, 1.0, 1.25)]
+    monkeypatch.setattr(trials, "tried_starts", lambda *_, **__: starts)
+    return first
+
+
+@pytest.mark.parametrize("where", ["next trial", "labels", "search"])
+def test_once_a_trial_is_done_its_flow_is_there(monkeypatch, where):
+    """The result is the flow that the trial fitted: a start that was cut short found nothing that is nearer."""
+    start = short_trials(monkeypatch)
+    tried = trials.trial(start, PENDULUM, PENDULUM.domain)
+    if where == "next trial":
+        then(monkeypatch, trials, "trial", interrupt, at=1)
+    else:
+        monkeypatch.setattr(trials, "tried_starts", lambda *_, **__: [start])
+        monkeypatch.setattr(trials, "DEAREST", 0.0)
+        name = {"labels": "prepare", "search": "next_minimum"}[where]
+        then(monkeypatch, TableRun, name, interrupt, at=1 if where == "labels" else SHORT["STARTS"])
+    with pytest.warns(RuntimeWarning, match=r"^Training .* because it was interrupted"):
+        flow = train(PENDULUM, reference_states=10, progress=False)
+    assert flow.dt == start.dt
+    for name, value in tried.flow.state_dict().items():
+        torch.testing.assert_close(flow.state_dict()[name], value, rtol=0, atol=1e-12)
+    assert 0 < one_step_error(flow) < 0.1
+
+
+def test_a_budget_and_the_training_time_count_the_trials(monkeypatch, clock):
+    seen = {}
+
+    def chosen(system, domain, session):
+        clock.now += 5.0
+        return trials.Trial(default_primed(system), 1e-6)
+
+    def go(self, session):
+        seen.update(left=session.deadline.left, seconds=session.passed)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(trials, "chosen_trial", chosen)
+    monkeypatch.setattr(TableRun, "go", go)
+    for options, whole in (({"time_budget": 70.0}, 70.0), ({}, math.inf)):
+        clock.now = 0.0
+        with pytest.raises(KeyboardInterrupt):
+            train(PENDULUM, progress=False, **options)
+        assert seen == {"left": whole - 5.0, "seconds": 5.0}

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 import sympflow
-from sympflow import HamiltonianSystem, LatticeStates, SympFlow, solve, train
+from sympflow import Box, HamiltonianSystem, LatticeStates, SympFlow, solve, train
+from sympflow.training import table_fit
+from sympflow.training.lattice_fit import TAIL, LatticeSubsystem
 
 BOND = "r**2/2 + r**4/4"
 FIT = {"restarts": 1, "steps": 8, "points": 20, "label_times": 3, "reference_states": 10, "progress": False}
@@ -85,3 +87,58 @@ def test_ends_at_which_the_numbers_do_not_hold_are_refused(flow, monkeypatch):
     monkeypatch.setitem(flow.figures, "ends_free", 3 * flow.figures["ends_periodic"])
     with pytest.raises(ValueError, match=r"^`system` 'lattice' has free ends"):
         solve(free, flow, (0, 5), y0)
+
+
+def test_a_piece_has_the_states_of_the_lattice():
+    y0 = LatticeStates(0.3, ring(200)).sample(1)[0]
+    low, high = ring(200, y0=y0).subsystem(8).domain.bounds
+    assert low == pytest.approx(0.3, rel=0.3)
+    assert high == pytest.approx(low, rel=1.0)
+    of_box = ring(6, domain=Box([-0.5] * 12, [0.5] * 12)).subsystem().domain
+    assert 0.01 < of_box.bounds[0] < of_box.bounds[1] < 1
+    large = ring(200)
+    fitted = LatticeSubsystem.of(large, LatticeStates((0.1, 0.3)).of(large))
+    assert fitted.domain.bounds == (0.1, TAIL * 0.3)  # a few neighbours have more than all of them
+    assert fitted.states.bounds == (0.1, 0.3)
+    assert ring(200).subsystem(8).domain is None
+    with pytest.raises(TypeError, match=r"^`system` 'H = .*' is not a lattice"):
+        HamiltonianSystem.from_sympy("p**2/2 + q**2/2").subsystem()
+    with pytest.raises(ValueError, match=r"^`sites` must be one to 3 positive integers"):
+        ring(200).subsystem(0)
+    with pytest.raises(ValueError, match=r"^`density` must be positive"):
+        LatticeStates((0.3, 0.2))
+    with pytest.raises(ValueError, match="`domain` is not known"):
+        train(ring(200))
+
+
+@pytest.mark.parametrize("boundary", ["periodic", "fixed", "free"])
+def test_the_expression_by_coordinates_is_the_same_H(boundary):
+    lattice = HamiltonianSystem.lattice(
+        onsite="a*u**2/2 + u**2*v**2",
+        bond={1: "c*r_u**2/2 + r_v**2/2 + r_u**2*r_v", 2: "r_u**4/4"},
+        fields=("u", "v"),
+        shape=(5, 6),
+        boundary=(boundary, "fixed"),
+        params={"a": np.linspace(1, 2, 30).reshape(5, 6), "c": 0.5},
+    )
+    written = HamiltonianSystem.from_sympy(lattice.local.written_out())
+    y = np.random.default_rng(0).normal(size=(3, 120))
+    np.testing.assert_allclose(written.hamiltonian(y), lattice.hamiltonian(y), rtol=1e-12)
+
+
+@pytest.mark.slow
+def test_a_fit_to_long_runs_keeps_the_energy_of_other_states(flow, monkeypatch):
+    """With the table that they found at Δt, which the numbers at shorter times lead to."""
+    monkeypatch.setattr(table_fit, "RUN_STEPS", 8)
+    lattice = ring(domain=LatticeStates(0.2))
+    further = train(lattice, flow=flow, runs=32, seed=1, **FIT | {"steps": 8})
+    assert [stage.get("runs") for stage in further.recipe["stages"]] == [None, 32]
+    large = ring(200, domain=LatticeStates(0.2))
+    y0 = large.domain.sample(4, seed=77)
+    errors = []
+    for each in (flow, further):
+        H = large.hamiltonian(solve(large, each, (0, 40), y0, t_eval=np.linspace(0, 40, 9)).states)
+        errors.append(np.sqrt(np.mean((H / H[:, :1] - 1) ** 2)))
+    assert errors[1] < errors[0]
+    numbers = [further.scheme(t).drifts for t in (0.2, 0.25)]
+    np.testing.assert_allclose(*numbers, atol=0.02)

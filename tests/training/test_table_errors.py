@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sympflow import Box, HamiltonianSystem, SympFlow
+from sympflow import Box, HamiltonianSystem, SympFlow, train
 from sympflow.flow.scaling import Scaling
 from sympflow.training.fits import PrimedFit
 from sympflow.training.points import Labels, box_without, shares_missed
@@ -45,3 +45,20 @@ def test_part_of_a_domain_that_spoils_a_fit_is_cut_off():
     assert 1.4 < high[1] <= 1.5
     assert -2.0 <= low[2] < -1.9
     assert box_without(x, x[:0]) is None
+
+
+FEW = {"restarts": 1, "steps": 8, "points": 40, "reference_states": 20, "progress": False}
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:The fit has a larger held-out error")  # than equal steps, which are as bad
+def test_a_flow_that_misses_most_of_a_step_comes_with_a_warning():
+    """The two-body problem in a box around its singularity, and a kink that Δt = 10 of three periods steps over."""
+    collisions = HamiltonianSystem.from_sympy(
+        "(p1**2 + p2**2)/2 - 1/sqrt(q1**2 + q2**2)", domain=Box([-1] * 4, [1] * 4)
+    )
+    kink = HamiltonianSystem.from_sympy("p**2/2 + sqrt(q**2 + 1e-8)", domain=Box([-1, -1], [1, 1]))
+    for system, dt in ((collisions, 0.2), (kink, 10.0)):
+        with pytest.warns(UserWarning, match="far from the exact one.*smaller `domain`.*shorter `dt`.*another `flow`"):
+            flow = train(system, flow=SympFlow.primed(system, 3, dt=dt, processor=2), **FEW)
+        assert np.isfinite(flow.figures["one_step_error"])

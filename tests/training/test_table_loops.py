@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from sympflow import HamiltonianSystem
+from sympflow.training.least_squares import _Factored
 from sympflow.training.points import Labels
 from sympflow.training.table_fit import TableFit
 from sympflow.training.table_step import TableStep
@@ -91,3 +92,22 @@ def test_steps_are_those_of_arrays(fits):
     c, y = 0.1 * rng.normal(size=(arrays.n_coefficients, 1)), 0.5 * rng.normal(size=(2 * arrays.ndof, 9))
     t0 = rng.uniform(0, 3, 9)  # of a driven system
     np.testing.assert_allclose(compiled(c, y, t0=t0), arrays(c, y, t0=t0), atol=1e-13)
+
+
+def test_steps_by_blocks_of_a_jacobian_are_those_by_the_whole(fits):
+    theta, compiled = np.random.default_rng(2).normal(size=5), fits[0][3]
+    r, blocks = compiled.model(theta)
+    assert blocks.matrices.shape[0] == 2
+    linear = lambda x: r + blocks.whole() @ (x - theta)  # noqa: E731
+    found = [
+        (model.scale, *model.trial(1e-3))
+        for residuals in (compiled.residuals, linear)
+        for J in (blocks, blocks.whole())
+        for model in [_Factored(theta, r, J, np.zeros(5), residuals)]
+    ]
+    for one, other in ((found[0], found[1]), (found[2], found[3])):
+        for mine, theirs in zip(one, other, strict=True):
+            np.testing.assert_allclose(mine, theirs, rtol=1e-9, atol=1e-12)
+    J, D = blocks.whole(), np.diag(np.where(found[0][0] > 0, found[0][0], 1.0))
+    exact = -np.linalg.lstsq(np.concatenate([J, 1e-3**0.5 * D]), np.append(r, np.zeros(5)), rcond=None)[0]
+    np.testing.assert_allclose(found[2][1] - theta, exact, rtol=1e-9, atol=1e-12)

@@ -1,8 +1,12 @@
 """Training: the losses, the improvement, resumption to the bit, and how a run ends."""
 
 import math
+import subprocess
+import sys
+import textwrap
 import zipfile
 
+import numpy as np
 import pytest
 import torch
 
@@ -16,7 +20,7 @@ from sympflow.systems import harmonic_oscillator, henon_heiles
 from sympflow.training import checkpoint as checkpoints
 from sympflow.training.losses import Loss
 from sympflow.training.optimizers import BFGSSteps, LBFGSSteps
-from sympflow.training.points import Points, PointSource
+from sympflow.training.points import Points, PointSource, Stream, states
 from sympflow.training.trainer import train
 
 QUICK = {"pairs": 1, "hidden": (5,), "points": 60, "validation_points": 60, "reference_states": 5, "progress": False}
@@ -191,3 +195,59 @@ def test_quasi_newton_methods_find_a_minimum(method):
     for k in range(5):
         method.step(k, rosenbrock)
     torch.testing.assert_close(module.x.detach(), torch.ones(2, dtype=torch.float64), rtol=0, atol=1e-8)
+
+
+def test_points_are_a_function_of_seed_and_step():
+    domain = henon_heiles().domain
+
+    def source(seed):
+        return PointSource(domain, 0.5, 40, 4, seed, torch.float64, CPU, block=4)
+
+    one, other = source(0), source(0)
+    t, x = one(9).residual
+    assert torch.equal(x, other(9).residual[1])
+    one(3)
+    assert torch.equal(one(9).residual[0], t)
+    for another in (one(8), source(1)(9)):
+        assert not torch.equal(another.residual[1], x)
+    sample = one(9)
+    assert domain.contains(x).all()
+    assert [a.shape for a in sample.matching] == [(4, 1), (4, 10, 4)]
+    assert 0 <= t.min() < t.max() <= 0.5
+    assert not np.array_equal(states(domain, 3, 0, Stream.RESIDUAL), states(domain, 3, 0, Stream.VALIDATION))
+
+
+def test_a_killed_process_resumes_bit_identical(tmp_path):
+    """A real process, ended by SIGKILL in the middle."""
+    path = tmp_path / "run.ckpt"
+    program = textwrap.dedent(
+        """
+        import os, signal, sys
+        from sympflow.systems import harmonic_oscillator
+        from sympflow.training.trainer import train
+
+        def kill(step, figures):
+            if step == 30:
+                os.kill(os.getpid(), signal.SIGKILL)
+
+        train(harmonic_oscillator(), steps=40, validate_every=10, checkpoint=sys.argv[1], checkpoint_every=7,
+              callback=kill, pairs=1, hidden=(5,), points=60, validation_points=60, reference_states=5)
+        """
+    )
+    run = subprocess.run([sys.executable, "-c", program, str(path)], capture_output=True, check=False)
+    assert run.returncode == -9, run.stderr.decode()
+    arguments = {"steps": 40, "validate_every": 10, **QUICK}
+    resumed = train(harmonic_oscillator(), resume=path, **arguments)
+    assert torch.equal(weights(resumed), weights(train(harmonic_oscillator(), **arguments)))
+    assert [p.name for p in tmp_path.iterdir()] == ["run.ckpt"]
+
+
+def test_a_system_that_is_not_separable():
+    def hamiltonian(q, p):
+        return ((1 + q.square()) * p.square()).sum(-1) / 2 + q.square().sum(-1) / 2
+
+    system = HamiltonianSystem(hamiltonian=hamiltonian, ndof=1, domain=Box([-1.0, -1.0], [1.0, 1.0]))
+    flow = train(system, 0.5, optimizer="bfgs", steps=3, **QUICK)
+    assert flow.history[-1]["loss"] < flow.history[0]["loss"] / 4
+    A = torch.autograd.functional.jacobian(lambda x: flow(3.2, x), torch.tensor([0.4, 0.3], dtype=torch.float64))
+    assert torch.linalg.det(A).item() == pytest.approx(1, abs=1e-13)

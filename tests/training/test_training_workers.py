@@ -1,17 +1,21 @@
 """Trials, starts, fits and rungs are shared by workers: the same bits come of it, and Ctrl-C ends it."""
 
 import os
+import pickle
 import signal
 import sys
 from concurrent.futures import ThreadPoolExecutor
 
+import numpy as np
 import pytest
 import torch
 
 from sympflow import HamiltonianSystem, SympFlow, systems, train
 from sympflow.training import trials
+from sympflow.training.fits import PrimedFit
 from sympflow.training.session import Session
-from sympflow.training.table_fit import TableFit
+from sympflow.training.starts import scaling_of
+from sympflow.training.table_fit import TableFit, TableRun
 from sympflow.workers import WorkerPool
 
 PENDULUM = systems.pendulum()
@@ -70,3 +74,18 @@ def test_what_cannot_be_pickled_is_named(monkeypatch):
     flow = SympFlow.primed(system, 2, dt=0.1, processor=0)
     with pytest.raises(TypeError, match=r"`system` cannot be sent to `workers` .*define its functions in a module"):
         train(system, flow=flow, workers=2, **QUICK)
+
+
+def test_fits_are_the_same_in_another_process():
+    """Their products are rounded by the order of arrays in memory, which a pickle must not change."""
+    few = {"points": 20, "label_times": 3, "reference_states": 5, "loss_points": 10, "matching_times": 2}
+    table = PrimedFit(loss="labels+residual", **few)
+    run = TableRun(FLOW, PENDULUM, PENDULUM.domain, scaling_of(PENDULUM.domain, FLOW.dt, 0), table)
+    theta = run.table.continued(run.frozen.coefficients(run.start_of(1))[0])
+    fits = [(run.frozen, run.start_of(1)), (run.weighted, run.start_of(0)), (run.whole, theta)]
+    for fit, x in fits:
+        for other in (pickle.loads(pickle.dumps(fit)), fit.own()):
+            assert all(np.array_equal(a, b) for a, b in zip(fit.linearized(x), other.linearized(x), strict=True))
+    run.table.assign(run.given)
+    run.whole.own().residuals(theta)
+    assert np.array_equal(run.table.parameters(), run.given)

@@ -1,5 +1,6 @@
 """The flow that `train` fits to a system of which nothing else is said: the cost of kicks, and short trials."""
 
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -103,3 +104,31 @@ def test_only_where_nothing_is_said_there_are_trials(monkeypatch, tmp_path):
     for options in ({"dt": 1.0}, {"restarts": 2}, {"points": 60}, {"time_budget": 5.0}, {"stages": 2}):
         assert flow_of(**options).curvatures is None
     assert made == [HH]
+
+
+@pytest.mark.slow
+def test_the_choice_is_the_same_however_slow_the_machine_is(monkeypatch):
+    """Clocks that run at another speed, now faster and now slower, change nothing: no time is measured."""
+    chosen = trials.chosen_trial(PENDULUM, PENDULUM.domain).start
+    random = np.random.default_rng(0)
+    for name in ("perf_counter", "process_time", "thread_time"):
+        clock = getattr(time, name)
+        monkeypatch.setattr(time, name, lambda clock=clock: clock() + 1e4 * random.random())
+    assert trials.chosen_trial(PENDULUM, PENDULUM.domain).start == chosen
+
+
+QUICK = {"STARTS": 2, "STEPS": 20, "FINAL_STEPS": 20, "POINTS": 40, "LENGTH": 50}
+
+
+def test_the_error_of_a_trial_is_that_of_its_orbits(monkeypatch):
+    """A whole fit of the same flow is as near, or nearer by what a longer search finds."""
+    for name, value in QUICK.items():
+        monkeypatch.setattr(trials, name, value)
+    start = replace(default_primed(PENDULUM), stages=2, processor=2)
+    error = trials.trial(start, PENDULUM, PENDULUM.domain).error
+    assert error == trials.trial(start, PENDULUM, PENDULUM.domain).error
+    options = {"restarts": 2, "steps": 20, "points": 40, "label_times": 2, "reference_states": 1, "progress": False}
+    flow = train(PENDULUM, flow=start.flow(PENDULUM), **options)
+    y0, t_span = PENDULUM.domain.sample(20, 1), (0, trials.LENGTH * start.dt)
+    sol = solve(PENDULUM, flow, t_span, y0=y0, on_domain_exit="ignore", backend="array")
+    assert 0.1 < error / np.median(max_energy_error(sol)) < 10

@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sympflow import Box, EnergySublevel, HamiltonianSystem
+from sympflow import Box, EnergySublevel, HamiltonianSystem, SympFlow, train
 from sympflow.training import trials
+from sympflow.training.table_fit import Table
 
 QUICK = {"PHASES": (1.5,), "STARTS": 2, "STEPS": 20, "FINAL_STEPS": 40, "POINTS": 40, "LENGTH": 50}
 QUICK |= {"SHAPES": (("222", 9, 1.0), ("121", 6, 1.0))}  # of more some are as good as each other but for rounding
@@ -43,3 +44,27 @@ def test_trials_and_the_choice_by_them_are_alike_in_all_units(monkeypatch):
     assert first == replace(second, dt=first.dt)
     assert first.dt == pytest.approx(second.dt, rel=1e-12)
     np.testing.assert_allclose(*np.log10([one.error for one in found]).reshape(2, -1), atol=0.5)
+
+
+@pytest.mark.parametrize("dt", [1e-13, 1e-6, 1.0, 8e5, 5e14])
+@pytest.mark.parametrize("options", [{"curvature": True}, {"polynomial": 6, "first": "kick"}], ids=["curved", "poly"])
+def test_the_parameters_of_a_table_are_found_at_every_step_length(dt, options):
+    """Its numbers are of size Δt, Δt³ and Δt⁵: powers of τ, in which the parameters are all of size one, tell them."""
+    flow = SympFlow.primed(oscillator(1.0, 1.0, 1.0), 4, dt=dt, processor=3, **options)
+    table = Table(flow)
+    offset, design = table.frozen(dt)
+    theta = np.random.default_rng(0).normal(size=design.shape[-1])
+    np.testing.assert_allclose(table.frozen_parameters(offset[0] + design[0] @ theta), theta, rtol=1e-14)
+
+
+@pytest.mark.parametrize("options", [{"curvature": True}, {"polynomial": 6, "first": "kick"}], ids=["curved", "poly"])
+def test_flows_are_alike_in_all_units(options):
+    """Among them lengths so long, and masses so small, that Ω is far larger in positions than in momenta or less."""
+    errors = []
+    for unit, period in zip(UNITS, PERIODS, strict=True):
+        system, (L, E, m) = oscillator(*unit), unit
+        flow = SympFlow.primed(system, 3, dt=0.8 * period, processor=2, **options)
+        flow = train(system, flow=flow, restarts=2, steps=20, points=40, reference_states=20, progress=False)
+        errors.append(flow.figures["one_step_error"] / np.hypot(L, np.sqrt(m * E)))
+    assert max(errors) < 3 * min(errors)
+    assert max(errors) < 1e-3
