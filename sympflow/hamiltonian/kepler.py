@@ -103,7 +103,9 @@ def solved(r: Any, eta: Any, zeta: Any, beta: Any, mu: Any, t: Any) -> Any:
         root = apply("sqrt", apply("abs", 16.0 * slope * slope - 20.0 * f * bend))
         new = X - 5.0 * f / (slope + root)
         between = where(high < math.inf, 0.5 * (low + high), 2.0 * X)
-        new = where((low <= new) & (new <= high), new, between)
+        even = apply("floor", 0.5 * going) * 2.0 == going
+        slow = (going < MOST - 20.0) & even  # far out on a hyperbola a step shortens √−β X by 5/3 only
+        new = where(slow, between, where((low <= new) & (new <= high), new, between))
         again = (CLOSE * apply("abs", new) < apply("abs", new - X)) & (going > 0.0)
         return again, [where(going > 0.0, new, X), low, high, where(again, going - 1.0, 0.0)]
 
@@ -122,7 +124,7 @@ def coefficients(X: Any, G: Sequence[Any], r: Any, inverse: Any, eta: Any, zeta:
     f, g, df = -(a * inverse), t - mu * G3, -(mu * G1 * inverse * end)
     dg = -(a * end)
     excess = fma(f, dg, fma(-g, df, f + dg))  # of fg′ − f′g over 1, by rounding; with a bias, if it is not taken back
-    dg = dg - where(f > -0.5, fma(f, f - 1.0, 1.0), 0.0) * excess
+    dg = dg - where(f > -0.5, fma(f, f - 1.0, 1.0) * excess, 0.0)
     return [f, g, df, dg, d, r * G1 + eta * G2]
 
 
