@@ -223,6 +223,9 @@ class Row:
             raise AttributeError(f"Row has no attribute {name!r}.", name=name, obj=self)
         return self.figures.get(name)
 
+    def __dir__(self) -> list[str]:
+        return [*super().__dir__(), *FIGURES]
+
     def __repr__(self) -> str:
         known = ((f.name, getattr(self, f.name), f.default) for f in fields(self) if f.name != "figures")
         filled = {name: value for name, value, default in known if name == "status" or value != default}

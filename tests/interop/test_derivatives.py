@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch.autograd import forward_ad
 from torch.autograd.functional import jacobian
-from torch.func import grad, hessian, jacfwd, jacrev, jvp, vjp, vmap
+from torch.func import functional_call, grad, hessian, jacfwd, jacrev, jvp, vjp, vmap
 
 from sympflow import HamiltonianSystem, MLPFlow, SympFlow, get, solve, systems
 from sympflow.interop.torchdiffeq import odeint, odeint_dense, odeint_event
@@ -110,6 +110,42 @@ class TestFlows:
         J = torch.stack([jacobian(lambda x, s=s: psi(float(s), x), y) for s, y in zip(t, Y, strict=True)])
         torch.testing.assert_close(vmap(jacrev(psi, 1))(t, Y), J, **CLOSE)
         torch.testing.assert_close(vmap(jacfwd(psi, 1))(t, Y), J, **CLOSE)
+
+    def test_derivatives_in_one_time(self, kind):
+        """A time () beyond Δt, and one that is a whole number of steps."""
+        psi = FLOWS[kind]()
+        for t in (0.7, 2 * psi.dt):
+            time = torch.tensor(t, dtype=torch.float64)
+            slope = jacobian(lambda s: psi(s, Y[0]), time)
+            assert slope.abs().max() > 0
+            torch.testing.assert_close(tangent_along_ones(lambda s: psi(s, Y[0]), time), slope, **CLOSE)
+            torch.testing.assert_close(jacfwd(psi)(time, Y[0]), slope, **CLOSE)
+            torch.testing.assert_close(jacrev(psi)(time, Y[0]), slope, **CLOSE)
+
+    def test_functional_weights(self, kind):
+        """Weights handed in by functional_call are those that run, in `odeint` too, though y0 is a plain tensor."""
+        psi = FLOWS[kind]().requires_grad_(True)
+        weights = dict(psi.named_parameters())
+
+        def end(w):
+            return functional_call(_End(psi), {f"psi.{name}": value for name, value in w.items()}, (Y,)).sum()
+
+        found = grad(end)(weights)
+        expected = torch.autograd.grad(odeint(PENDULUM, Y, T, method=psi)[-1].sum(), list(weights.values()))
+        for name, value in zip(weights, expected, strict=True):
+            torch.testing.assert_close(found[name], value, **CLOSE)
+        ones = {name: torch.ones_like(value) for name, value in weights.items()}
+        along = sum(value.sum() for value in expected)
+        torch.testing.assert_close(jvp(end, (weights,), (ones,))[1], along, rtol=1e-9, atol=1e-12)
+
+
+class _End(torch.nn.Module):
+    def __init__(self, psi):
+        super().__init__()
+        self.psi = psi
+
+    def forward(self, y):
+        return odeint(PENDULUM, y, T, method=self.psi)[-1]
 
 
 class TestNumbersOfH:

@@ -184,7 +184,7 @@ def test_metrics_that_were_not_asked_for_are_none():
 
 
 def test_the_repr_of_a_row_shows_what_is_filled_in():
-    row = Row("pendulum", "verlet", "verlet", energy_error=0.0, run_time=1.5)
+    row = Row("pendulum", "verlet", "verlet", run_time=1.5, figures={"energy_error": 0.0})
     assert repr(row) == (
         "Row(system='pendulum', method='verlet', label='verlet', status='ok', run_time=1.5, energy_error=0.0)"
     )

@@ -146,9 +146,9 @@ def test_a_flow_in_another_time_is_a_point_as_it_is_a_row_of_compare():
 
 
 def test_training_has_paid_for_itself_when_the_time_saved_is_that_of_training():
-    rival = [Row("s", "verlet", "verlet", energy_error=e, run_time=0.01 / e) for e in (1e-2, 1e-4)]
-    flow = Row("s", "sympflow", "sympflow", energy_error=1e-3, run_time=4.0, training_time=60.0)
-    slow = Row("s", "sympflow", "slow", energy_error=1e-3, run_time=40.0, training_time=60.0)
+    rival = [Row("s", "verlet", "verlet", run_time=0.01 / e, figures={"energy_error": e}) for e in (1e-2, 1e-4)]
+    flow = Row("s", "sympflow", "sympflow", run_time=4.0, training_time=60.0, figures={"energy_error": 1e-3})
+    slow = Row("s", "sympflow", "slow", run_time=40.0, training_time=60.0, figures={"energy_error": 1e-3})
     *_, quick, never = break_even([*rival, flow, slow], length=100.0)
     assert quick.break_even == pytest.approx(60 / ((10 - 4) / 100))
     assert never.break_even == math.inf
