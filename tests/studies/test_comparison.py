@@ -188,3 +188,10 @@ def test_the_repr_of_a_row_shows_what_is_filled_in():
     assert repr(row) == (
         "Row(system='pendulum', method='verlet', label='verlet', status='ok', run_time=1.5, energy_error=0.0)"
     )
+
+
+def test_a_row_lists_its_figures_for_completion():
+    row = Row("pendulum", "verlet", "verlet", figures={"energy_error": 1e-3})
+    assert row.energy_error == 1e-3
+    assert row.volume_error is None
+    assert {"energy_error", "volume_error", "run_time"} <= set(dir(row))
