@@ -350,7 +350,7 @@ INSTEAD = {
     ),
     **dict.fromkeys(("integrator", "solver", "algorithm", "scheme"), "the method is `method`"),
     **dict.fromkeys(("abstol", "reltol"), "tolerances of adaptive methods are `rtol` and `atol`"),
-    **dict.fromkeys(("jac", "vectorized", "fun"), "leave it out: H tells the forces and their derivatives"),
+    **dict.fromkeys(("jac", "vectorized", "fun"), "leave it out: forces and their derivatives follow from H"),
     **dict.fromkeys(("verbose", "progress_bar"), "a bar is `progress`"),
     **dict.fromkeys(("n_jobs", "n_workers", "num_workers"), "sympflow.ensemble has `workers`"),
     "dt": "steps to try are `steps`, and a method with one step is sympflow.get(name)(dt=...)",

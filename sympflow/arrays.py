@@ -129,7 +129,7 @@ def to_numpy(x: Array) -> np.ndarray:
     if found is None or (found is not x and found.ndim != np.ndim(x)):
         where = "in a graph that torch.compile traces" if found is None else "inside torch.func.vmap"
         raise TypeError(
-            f"The values of a tensor of shape {tuple(x.shape)} are needed as numbers, which it has not {where}: make "
+            f"The values of a tensor of shape {tuple(x.shape)} are needed as numbers, and it has none {where}: make "
             "this call outside, on the results."
         )
     return found

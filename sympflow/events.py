@@ -34,7 +34,7 @@ class Event:
         try:
             number = float(to_numpy(value))
             if isinstance(value, bool | np.bool_):
-                raise TypeError(f"it returned {value}, which does not tell where the event is")
+                raise TypeError(f"it returned {value}, which does not locate the event")
         except (TypeError, ValueError) as error:
             raise TypeError(
                 f"{self.label} must return one number for a time and a state of shape {tuple(y.shape)}; {error}. "
@@ -153,7 +153,7 @@ class EventSearch:
             if len(self.found[i]) >= self.events[i].limit:
                 if followed:
                     warn(
-                        "The state at the event that ends the run carries no derivative, nor does its time: use "
+                        "The state at the event that ends the run has no gradient, nor has its time: use "
                         "sympflow.interop.torchdiffeq.odeint_event, which gives both.",
                         UserWarning,
                     )

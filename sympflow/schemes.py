@@ -451,7 +451,8 @@ def scheme_named(name: str) -> Scheme:
         return checked_scheme(scheme)
     except (TypeError, ValueError) as error:
         raise ImportError(
-            f"`scheme` {name!r} of the plug-in {distribution(point)} is not a usable scheme ({error}): report it there."
+            f"`scheme` {name!r} of the plug-in {distribution(point)} is not a usable scheme ({error}): report this to "
+            "its author."
         ) from error
 
 
@@ -491,8 +492,8 @@ def checked_scheme(scheme: Any) -> Scheme:
         total = fsum(getattr(scheme, column))
         if abs(total - 1) > 1e-12:
             raise ValueError(
-                f"`scheme` {scheme.name!r} has {column} that add up to {total!r}, and order {order} needs 1: mend the "
-                "table, or declare order=None."
+                f"`scheme` {scheme.name!r} has {column} that add up to {total!r}, and order {order} needs 1: correct "
+                "the table, or declare order=None."
             )
     return scheme
 

@@ -451,10 +451,12 @@ def check_solution(sol: object, name: str = "sol") -> None:
 def energy_change(sol: Solution, relative: bool = True) -> np.ndarray:
     """H(y(t)) − H(y0) in float64, (..., n): the metric `sympflow.energy_error`, where it is documented."""
     sol.system.check_conservative(
-        "so its energy is lost and no error",
+        "so a loss of energy is not an error",
         "use sympflow.conformal_defect(sol), which is 0 for the exact flow, or sympflow.reference_error(sol)",
     )
-    sol.system.check_autonomous("so its energy is not kept and has no error", "use sympflow.energy_balance_error(sol)")
+    sol.system.check_autonomous(
+        "so its energy is not conserved and has no error", "use sympflow.energy_balance_error(sol)"
+    )
     with np.errstate(all="ignore"):
         states, t0 = to_numpy(sol.states), sol.t_span[0]
         error = _energy(sol, states, t0) - _energy(sol, sol.y0, t0)[..., None]

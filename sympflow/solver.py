@@ -670,7 +670,7 @@ def _check_outcome(outcome: Any, integrator: Integrator, y0: Array) -> None:
             what = f"status {outcome.status!r}, t and y of shapes {shapes}"
         raise TypeError(
             f"`method` {integrator.name!r} must answer with an Outcome that has an integer status, t of shape (n,) and "
-            f"y of shape (n, *y0.shape); got {what}. Mend its run(): check_integrator tests it."
+            f"y of shape (n, *y0.shape); got {what}. Correct its run(): check_integrator tests it."
         )
     if outcome.finite or known_finite(outcome.y):
         return

@@ -248,8 +248,8 @@ def mapped(
             if isinstance(workers, futures.Executor) and not done:  # broken for good
                 n = getattr(workers, "_max_workers", None) or available_cores()
                 warnings.warn(
-                    f"`workers` is an executor of which a process died, so that it takes no more work: the rest is "
-                    f"done in {n} new processes.",
+                    "A process of the executor `workers` died, so that it accepts no more work: the rest is done in "
+                    f"{n} new processes.",
                     RuntimeWarning,
                     stacklevel=2,
                 )

@@ -298,7 +298,7 @@ CALLABLES = {
         from_potential,
         lambda q: np.sin(q.numpy()).sum(-1),
         TypeError,
-        "`potential` (could not be traced, for it fails on an array|must return an array of the library)",
+        "`potential` (could not be traced, because it fails on an array|must return an array of the library)",
     ),
     "H raises": (from_hamiltonian, divide, ZeroDivisionError, DIVISION),
     "H None": (from_hamiltonian, lambda q, p: None, ValueError, f"{H} shape"),
@@ -348,7 +348,7 @@ PLUGINS = {
     "step of float32": (plugin(step=lambda self, system, t, y, h: y.astype("f4")), TypeError, STEP),
     "step None, later": (later(lambda y: None), TypeError, STEP),
     "step NaN": (plugin(step=lambda self, system, t, y, h: math.nan * y), None, "non-finite"),
-    "no step": (plugin(), TypeError, "`method` 'plugin' has no bare step"),
+    "no step": (plugin(), TypeError, "`method` 'plugin' cannot be stepped by itself"),
     "check raises": (plugin(check=divide), ZeroDivisionError, DIVISION),
     "run raises": (plugin(run=divide), ZeroDivisionError, DIVISION),
     "run None": (answers(None), TypeError, ANSWER),
@@ -469,7 +469,10 @@ SCENES = {
     "half a period": (lambda: made(TEXT, **DRIVE, period=math.pi / 1.7), "`period` .* is not a period of H"),
     "an infinite period": (lambda: made(TEXT, **DRIVE, period=math.inf), "`period` must be positive"),
     "energy of a drive": (lambda: energy_error(by_arrays(DRIVEN)), "`system` 'driven' .*balance_error"),
-    "energy of friction": (lambda: energy_error(by_arrays(DAMPED)), "`system` 'damped' .* energy is lost"),
+    "energy of friction": (
+        lambda: energy_error(by_arrays(DAMPED)),
+        "`system` 'damped' .* loss of energy is not an error",
+    ),
     "another time": (lambda: time_transformed(DRIVEN), "`system` 'driven' is driven, .* needs an energy E"),
     "a log clock": (lambda: solve(DRIVEN, "log_kahan_li8"), "`system` 'driven' .*'log_kahan_li8' does not"),
     "a flow of no drive": (lambda: solve(DRIVEN, shipped()), "`system` 'driven' is driven"),
@@ -478,7 +481,7 @@ SCENES = {
     "copies of a function that branches": (
         lambda: solve(HamiltonianSystem(hamiltonian=of_numpy, ndof=1, **SCENE), "tao4"),
         TypeError,
-        "`hamiltonian` could not be traced, for it branches on a value: write np.where",
+        "`hamiltonian` could not be traced, because it branches on a value: write np.where",
     ),
     "copies with friction": (lambda: solve(DAMPED, "tao4"), "`system` 'damped' has friction, .*'tao4'"),
     "compensated Gauss with friction": (

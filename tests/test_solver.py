@@ -133,7 +133,7 @@ def test_a_limit_on_steps_keeps_what_was_computed(method):
     sol = solve(fast, method, (0, 1000), [1.0, 0.0])
     assert (sol.status, sol.stats["n_steps"], len(sol.t)) == (-1, 10_000, 10_001)
     assert re.match(r"After 10,000 steps t = 0\.0\d+ is reached.* `max_steps` is 10,000,000\. Raise it", sol.message)
-    assert sol.message.endswith("terms of H that cancel lose digits, and are to be written otherwise.")
+    assert sol.message.endswith("terms of H that cancel lose digits: rewrite them.")
     few = solve(HH, method, (0, 100), max_steps=7, dense_output=True)
     whole = solve(HH, method, (0, 100))
     assert (few.status, few.stats["n_steps"], few.stats["failed_at"]) == (-1, 7, few.t[-1])

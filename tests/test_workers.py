@@ -100,7 +100,7 @@ def test_an_executor_one_of_whose_processes_dies(tmp_path):
     context = multiprocessing.get_context("spawn")
     with (
         ProcessPoolExecutor(2, context) as pool,
-        pytest.warns(RuntimeWarning, match="`workers` is an executor of which"),
+        pytest.warns(RuntimeWarning, match="A process of the executor `workers`"),
     ):
         assert collected(plus_square_but_die_once, str(tmp_path / "died"), pool) == EXPECTED
 

@@ -113,7 +113,7 @@ def reporting(context: typer.Context) -> Iterator[None]:
         err.print(f"Failed: {in_options(str(error), context)}", style="red", markup=False)
         raise typer.Exit(1) from error
     except MemoryError as error:
-        err.print(f"Failed: the memory is full ({error}): ask for less.", style="red", markup=False)
+        err.print(f"Failed: out of memory ({error}): ask for fewer outputs or states.", style="red", markup=False)
         raise typer.Exit(1) from error
     except KeyboardInterrupt as error:
         err.print(f"Interrupted. {error}".strip(), style="red", markup=False)
@@ -127,7 +127,13 @@ def _set_quiet(quiet: bool) -> bool:
 
 Quiet = Annotated[
     bool,
-    Option("--quiet", "-q", callback=_set_quiet, is_eager=True, help="Print errors and warnings alone; files as ever."),
+    Option(
+        "--quiet",
+        "-q",
+        callback=_set_quiet,
+        is_eager=True,
+        help="Print only errors and warnings; files are written as usual.",
+    ),
 ]
 
 

@@ -18,12 +18,12 @@ if TYPE_CHECKING:
 def learn(
     ctx: typer.Context,
     data: Annotated[Path, typer.Argument(help="A CSV, Parquet, npz, NetCDF or zarr file: t, q1 …, p1 …, the orbit.")],
-    ndof: Annotated[int | None, Option(help="Degrees of freedom, where columns bear other names.")] = None,
+    ndof: Annotated[int | None, Option(help="Degrees of freedom, where columns have other names.")] = None,
     dt: Annotated[Number, Option(help="Δt of the flow. Default: what suits its frequencies.")] = None,
     noise: Annotated[Number, Option(help="Standard deviation of the data. Default: estimated.")] = None,
     period: Annotated[Number, Option(help="Of all q, if these are angles.")] = None,
     damping: Annotated[bool, Option("--damping", help="Learn a rate of friction as well.")] = False,
-    drag: Annotated[bool, Option("--drag", help="Learn quadratic drag in place of that.")] = False,
+    drag: Annotated[bool, Option("--drag", help="Learn quadratic drag instead.")] = False,
     drive: Annotated[Text, Option(help="Learn a drive as well: its angular frequency, about, or find.")] = None,
     separable: Annotated[
         bool | None,
@@ -47,7 +47,7 @@ def learn(
         list[str] | None, Option("--unit", help="Units of columns, as t=ms, q=deg, p=deg/ms; may be repeated.")
     ] = None,
     seed: Annotated[int, Option(help="Which trajectories are held out.")] = 0,
-    time_budget: Annotated[float, Option(help="Seconds that it may take.")] = 60.0,
+    time_budget: Annotated[float, Option(help="Time limit in seconds.")] = 60.0,
     checkpoint: Annotated[File, Option(help="File to keep the state of the run in.")] = None,
     resume: Annotated[File, Option(help="Checkpoint to go on from.")] = None,
     to: Annotated[Path, Option("--out", help="File for the flow.")] = Path("flow.safetensors"),
@@ -89,9 +89,9 @@ def learn(
     titles = ("model", "numbers", "held-out loss", "correlation")
     print_table(titles, [[form.format(**h) for form in cells.split()] for h in flow.history])
     learned = flow.recipe["learned"]
-    out.print(f"Chosen: {learned['model']}, for {learned['reason']}", markup=False)
+    out.print(f"Chosen: {learned['model']}, because {learned['reason']}", markup=False)
     formula = learned.get("physical")
-    show("H is the flow's own, of no formula." if formula is None else f"H = {formula}")
+    show("H is the flow's own, not a formula." if formula is None else f"H = {formula}")
     if learned.get("drag"):
         show(f"drag = {', '.join(learned['drag'])}")
     if flow.system.friction:

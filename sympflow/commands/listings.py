@@ -71,7 +71,7 @@ def flows(system: Systems = None, own: Own = None, quiet: Quiet = False) -> None
 def methods(
     name: Annotated[
         str | None,
-        typer.Argument(help="A method, to show all that is known of it.", autocompletion=completion.one_method),
+        typer.Argument(help="A method: show all its properties.", autocompletion=completion.one_method),
     ] = None,
     quiet: Quiet = False,
 ) -> None:

@@ -203,7 +203,7 @@ def section(
     t_end: TEnd = None,
     y0: Annotated[
         list[str] | None,
-        Option("--y0", help="Initial state q,p; several times for several orbits. Default: the system's."),
+        Option("--y0", help="Initial state q,p; repeat it for several orbits. Default: the system's."),
     ] = None,
     energy: Annotated[
         Number, Option(help="Instead: states of this energy on the plane, 16 or as many as --orbits.")
@@ -292,7 +292,7 @@ def _starts(scene: words.Scene, y0: list[str] | None, orbits: int | None, seed: 
         raise ValueError("`--orbits` and `--y0` both choose the initial states: give one of them.")
     check_counts(orbits=orbits)
     if scene.system.domain is None:
-        raise ValueError(f"`--orbits` draws from the domain, which {scene.key} has not: give `--y0`, or a domain.")
+        raise ValueError(f"`--orbits` draws from the domain, and {scene.key} has none: give `--y0`, or a domain.")
     if seed < 0:
         raise ValueError(f"`--seed` must be a whole number from 0 on; got {seed}.")
     return scene.system.domain.sample(orbits, seed=seed)

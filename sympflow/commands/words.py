@@ -47,7 +47,7 @@ Systems = Annotated[
     list[str] | None,
     typer.Argument(
         metavar="SYSTEM",
-        help="See `sympflow systems`; an own one: file.py:name, file.toml; parameters as --omega 100.",
+        help="A name that `sympflow systems` lists, or file.py:name, file.toml, a formula; parameters as --omega 100.",
         show_default=False,
         autocompletion=_systems,
     ),
@@ -57,7 +57,7 @@ Own = Annotated[
     Option(
         "--system",
         metavar="SYSTEM",
-        help="A system, as the argument is; several times for several.",
+        help="A system, given like the argument; repeat it for several systems.",
         autocompletion=_systems,
     ),
 ]
@@ -79,7 +79,7 @@ BACKENDS = ("auto", "compiled", "array")
 
 def _backend(word: str) -> str:
     if word not in BACKENDS:
-        raise typer.BadParameter(f"{word!r} is none of {', '.join(BACKENDS)}.")
+        raise typer.BadParameter(f"{word!r} is not one of {', '.join(BACKENDS)}.")
     return word
 
 
@@ -112,7 +112,9 @@ def made(scene: str, **params: Any) -> HamiltonianSystem:
     system = factory_of(scene)(**params)
     if not isinstance(system, HamiltonianSystem):
         what = type(system).__name__
-        raise ImportError(f"`system` {scene!r} makes no HamiltonianSystem but a {what}: report it where it is from.")
+        raise ImportError(
+            f"`system` {scene!r} must make a HamiltonianSystem; it makes a {what}: report this to its author."
+        )
     return system
 
 

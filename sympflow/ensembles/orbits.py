@@ -90,7 +90,7 @@ class Drawn:
                 f"{states.dtype} of shape {states.shape}."
             )
         if not np.isfinite(states).all():
-            raise ValueError("`y0` draws states that are not finite: mend the sampler.")
+            raise ValueError("`y0` draws states that are not finite: correct the sampler.")
         return states
 
     @property

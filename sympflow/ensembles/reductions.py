@@ -106,8 +106,8 @@ class EnergyError(Reduction):
     """
 
     def check(self, system: HamiltonianSystem) -> None:
-        system.check_conservative("so its energy is lost and no error", "use another `reduce`, such as 'final'")
-        system.check_autonomous("so its energy is not kept", "use another `reduce`, such as 'final'")
+        system.check_conservative("so a loss of energy is not an error", "use another `reduce`, such as 'final'")
+        system.check_autonomous("so its energy is not conserved", "use another `reduce`, such as 'final'")
 
     def fields(self, problem: Chunk) -> Fields:
         return {"energy_error": ((), np.dtype(float))}
@@ -159,7 +159,7 @@ class OfFunction(Reduction):
                 raise ValueError(f"`reduce` cannot be kept: {error}") from None
             return dict(self.found)
         raise ValueError(
-            f"`reduce` cannot be tried: the first {len(problem)} orbits all fail. Reduce `dt`, or mend `y0`."
+            f"`reduce` cannot be tried: the first {len(problem)} orbits all fail. Reduce `dt`, or correct `y0`."
         )
 
     def reduce(self, chunk: Chunk) -> dict[str, np.ndarray]:

@@ -145,7 +145,9 @@ class Layout:
         """Return the arrays of a store with chunks of such a shape along the axes."""
         for name, (_, dtype) in self.fields.items():
             if not is_name(name):
-                raise ValueError(f"`reduce` returns {name!r}, which no array of a `store` can be called: rename it.")
+                raise ValueError(
+                    f"`reduce` returns {name!r}, which cannot be the name of an array in a `store`: rename it."
+                )
             if dtype.kind not in STORABLE:
                 raise TypeError(f"`reduce` returns {name!r} of {dtype}, and a `store` takes numbers: convert them.")
         made = {v.name: (v.dims, (*self.shape, *v.shape), v.dtype, (*sizes, *v.shape)) for v in self.variables()}

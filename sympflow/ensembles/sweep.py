@@ -190,7 +190,7 @@ def ensemble(
     except Unpicklable as error:
         raise _unpicklable(task, orbits, error) from error
     except LostWorkers as error:
-        whatever = "Nothing is kept: name a `store`, which is."
+        whatever = "Nothing was kept: name a `store` to keep finished chunks."
         if store is not None:
             whatever = f"{done} of {len(pieces)} chunks are in `store` {str(store)!r}: call again with resume=True."
         raise RuntimeError(f"{error} {whatever}") from error
@@ -392,7 +392,7 @@ def _reduced(task: Task, chunk: Chunk, start: int) -> Done:
     for name, (_, dtype) in task.fields.items():
         found = np.asarray(fields[name]).dtype
         if not np.can_cast(found, dtype, "same_kind"):
-            raise TypeError(f"`reduce` returns {name} as {found}, which its `fields` told as {dtype}: let them agree.")
+            raise TypeError(f"`reduce` returns {name} as {found}, but its `fields` declare {dtype}: make them agree.")
     return Done(fields, chunk.status, {start + k: text for k, text in chunk.messages.items()})
 
 

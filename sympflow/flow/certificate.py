@@ -121,7 +121,9 @@ class Certificate:
         if isinstance(description, dict):
             description = {"relative_limit": None, **description}
         if not isinstance(description, dict) or set(description) != {f.name for f in fields(cls)}:
-            raise ValueError("`description` is not one of a certificate: compute it again by flow.certificate(system).")
+            raise ValueError(
+                "`description` is not the description of a certificate: compute it again by flow.certificate(system)."
+            )
         return cls(**{f.name: _checked(f.name, str(f.type), description[f.name]) for f in fields(cls)})
 
     def __str__(self) -> str:

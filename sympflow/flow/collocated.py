@@ -51,7 +51,7 @@ class CollocationLayer(OwnLayer):
 
     def pull_back(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         flow, y, h = self.flow, torch.cat([q, p]).T, -t / self.flow.steps
-        flow.bound_system.check_conservative("so `flow` has no Hamiltonian", "ask its system for H")
+        flow.bound_system.check_conservative("so `flow` has no Hamiltonian", "use the H of its system")
         K, _ = flow.stages_of(y, h)  # of the way back, whose stages are those of the step
         A = torch.as_tensor(flow.tableau[0], dtype=y.dtype, device=y.device)
         mean = (flow.weights * flow.bound_system.hamiltonian(y[:, None, :] + A @ K)).sum(-1)
@@ -130,7 +130,8 @@ class CollocatedFlow(SystemFlow):
                 states = system.domain.sample(SAMPLED, 0)
             if states is None:
                 raise ValueError(
-                    "`steps` is needed, for the system has no domain over which errors could be compared: give it, or "
+                    "`steps` is needed, because the system has no domain over which errors could be compared: give "
+                    "it, or "
                     "`states`."
                 )
             x, width = floats("states", states), 2 * system.ndof

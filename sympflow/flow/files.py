@@ -84,7 +84,7 @@ def write(
     try:
         Provenance.of_record(record, architecture["ndof"])
     except Refused as reason:
-        raise ValueError(f"`flow` cannot be saved as it is: {reason}. Set it right first.") from None
+        raise ValueError(f"`flow` cannot be saved as it is: {reason}. Correct it first.") from None
     text = json.dumps(record, allow_nan=False, separators=(",", ":"))
     content = save_tensors(tensors, {KEY: text, records.SUM: text_checksum(text)})
     if (length := struct.unpack("<Q", content[:8])[0]) > records.MAX_HEADER:

@@ -561,7 +561,7 @@ class FlowMap(KnownFlow, Shown, nn.Module):
         """The figure of so many steps."""
         domain = self.domain if system is None else self.domain_for(system) or system.domain
         if domain is None and (system is None or system.y0 is None):
-            raise ValueError("`system` is needed, for the flow has no domain to start in: pass one with a `y0`.")
+            raise ValueError("`system` is needed, because the flow has no domain to start in: pass one with a `y0`.")
         if isinstance(domain, EnergySublevel) and domain.hamiltonian is None:
             raise ValueError(
                 "`system` is needed, whose H bounds the domain of the flow: pass it, or load the flow with it."

@@ -149,7 +149,7 @@ class KnownFlow:
             )
         if system.local is not None and self.lattice_terms:
             raise ValueError(
-                f"`system` {system.name!r} is of another kind than that of this flow: its parts differ, or it has "
+                f"`system` {system.name!r} differs in kind from that of this flow: its parts differ, or it has "
                 f"other forces or a box. {remedy[0].upper()}{remedy[1:]}"
             )
         if system.ndof != self.ndof:

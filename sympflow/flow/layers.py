@@ -90,7 +90,7 @@ class Binding:
     def system(self) -> HamiltonianSystem:
         if self._system is None:
             raise ValueError(
-                f"`flow` is {self._made}, which its file does not hold: give it by "
+                f"`flow` is {self._made}, which is not in its file: give it by "
                 "sympflow.load(path, system=system) or flow.bind(system)."
             )
         return self._system

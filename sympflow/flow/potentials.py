@@ -171,7 +171,8 @@ class Register(Generic[T]):
             self.added[name] = self.checked(name, load_announced(point, self.kind))
         except (TypeError, ValueError) as error:
             raise ImportError(
-                f"`{self.kind}` {name!r} of the plug-in {distribution(point)} is not valid ({error}): report it there."
+                f"`{self.kind}` {name!r} of the plug-in {distribution(point)} is not valid ({error}): report this to "
+                "its author."
             ) from error
         return self.added[name]
 
@@ -242,17 +243,17 @@ def _checked_activation(name: str, activation: Any, compiled: Any = None) -> Act
     expected = {"value": value.detach(), "slope": slope, "dvalue": slope * da, "dslope": second * da}
     for what, found in zip(expected, activation.tangent(a, da), strict=True):
         if not torch.allclose(found, expected[what], rtol=1e-9, atol=1e-9):
-            raise ValueError(f"`activation` {name!r} has a tangent() whose {what} is not that of value(): mend it.")
+            raise ValueError(f"`activation` {name!r} has a tangent() whose {what} is not that of value(): correct it.")
     for found, of in zip(activation.slope(a), ("value", "slope"), strict=True):
         if not torch.allclose(found, expected[of], rtol=1e-9, atol=1e-9):
-            raise ValueError(f"`activation` {name!r} has a slope() that is not the derivative of value(): mend it.")
+            raise ValueError(f"`activation` {name!r} has a slope() that is not the derivative of value(): correct it.")
     if activation.compiled is not None:
         if not callable(activation.compiled):
             raise TypeError(f"`compiled` must be a function of a number; got {activation.compiled!r}.")
         function = getattr(activation.compiled, "py_func", activation.compiled)  # Numba's, not compiled for this
         pairs = torch.tensor([tuple(function(number)) for number in a.reshape(-1).tolist()], dtype=torch.float64)
         if not torch.allclose(pairs, torch.stack([expected["value"], slope], -1).reshape(-1, 2), rtol=1e-9, atol=1e-9):
-            raise ValueError(f"`compiled` does not return the value and the slope of activation {name!r}: mend it.")
+            raise ValueError(f"`compiled` does not return the value and the slope of activation {name!r}: correct it.")
     return activation
 
 
@@ -652,7 +653,7 @@ def _activation_of(module: nn.Module) -> str:
                 if values.shape == a.shape and bool((values.to(a) - sigma.value(a)).abs().max() < 5 * tolerance):
                     return name
     raise ValueError(
-        f"`potentials` have an activation {_short(module)} that is none of {', '.join(known)}: register it by "
+        f"`potentials` have an activation {_short(module)} that is not one of {', '.join(known)}: register it by "
         "sympflow.flow.potentials.register_activation(name, activation)."
     )
 

@@ -149,9 +149,7 @@ class PrimedDrift(Drift):
 
     def pull_back(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         system = self._binding.system
-        system.check_conservative(
-            "and a damped flow is not Hamiltonian", "ask for flow.velocity, or for system.hamiltonian"
-        )
+        system.check_conservative("and a damped flow is not Hamiltonian", "use flow.velocity, or system.hamiltonian")
         return *self.inverse(t, q, p), self._time.rate(t) * system.kinetic(p.T)
 
 

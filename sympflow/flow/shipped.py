@@ -260,7 +260,8 @@ def choose(
             )
         there = ", ".join(dict.fromkeys(f.system for f in shipped_flows(kind=kind)))
         raise ValueError(
-            f"`system` {system.name!r} has no shipped {kind} flow (there are some of: {there or 'none'}): train one by "
+            f"`system` {system.name!r} has no shipped {kind} flow (there are some for: {there or 'none'}): train one "
+            "by "
             f"flow = sympflow.train(system{', kind=' + repr(kind) if kind != 'sympflow' else ''}) and pass flow=flow."
         )
     if tol is None:

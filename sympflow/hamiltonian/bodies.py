@@ -65,8 +65,8 @@ class PairsHamiltonian(LocalHamiltonian):
         self.softening = _checked_length("softening", softening) or 0.0
         if self.cutoff is not None and self.box is not None and self.cutoff > self.box.min() / 2:
             raise ValueError(
-                f"`cutoff` {self.cutoff:g} is longer than half the box, {self.box.min() / 2:g}: a body would meet "
-                "another and its image. Take a shorter one, or a larger `box`."
+                f"`cutoff` {self.cutoff:g} is longer than half the box, {self.box.min() / 2:g}: a body would interact "
+                "with another one and with its image. Take a shorter one, or a larger `box`."
             )
         self.signed = self.box is None and not self.softening  # bodies pass at r = 0 if they change places on a line
         self.leaps = not self.softening
@@ -401,7 +401,8 @@ class PairsHamiltonian(LocalHamiltonian):
         before, after = ((self._of_bodies(x[self.ndof :]) ** 2).sum(-1) / self.inertia for x in (start, y))
         i, j = sorted(np.argsort(after - before)[-2:].tolist())
         return (
-            f"the bodies {i} and {j} have gained most: they met within one step. Reduce `dt`, take `softening`, or "
+            f"the bodies {i} and {j} have gained most energy: they met within one step. Reduce `dt`, take "
+            "`softening`, or "
             "a method with a clock of its own, such as 'log_leapfrog'"
         )
 

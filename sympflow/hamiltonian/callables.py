@@ -430,7 +430,7 @@ class CallableHamiltonian(Definition):
             raise ValueError(
                 "`hessian_vector` is needed here (force-gradient methods, volume and symplecticity metrics) and was "
                 "not given: pass it to HamiltonianSystem, or write `potential` so that it can be traced and leave "
-                f"`gradient` out; it was not, for {self.untraced}."
+                f"`gradient` out; it could not be, because {self.untraced}."
             )
         if self._gradient is not None:
             return jacobian(partial(self._gradient, *t), x)[1]
@@ -564,12 +564,13 @@ def _with_torch(
             failure = error
     if untraced and (isinstance(value, np.ndarray | np.generic) or (failure and of_numpy)):
         raise TypeError(
-            f"`{name}` could not be traced, for {untraced}, and torch cannot differentiate it. Write it with functions "
+            f"`{name}` could not be traced, because {untraced}, and torch cannot differentiate it. Write it with "
+            "functions "
             "that have a rule, or pass `gradient` as well, as spline(q, 1) of a spline of SciPy, or use "
             "HamiltonianSystem.from_sympy."
         ) from failure
     if failure:
-        traced = f", and could not be traced, for {untraced}" if untraced else ""
+        traced = f", and could not be traced, because {untraced}" if untraced else ""
         raise TypeError(
             f"`{name}` failed on a torch tensor of shape {tuple(x.shape)} ({failure}){traced}. Write it with NumPy's "
             "or torch's functions of (..., d) arrays, or pass `gradient` as well, or use HamiltonianSystem.from_sympy."

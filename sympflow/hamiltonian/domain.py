@@ -228,7 +228,7 @@ class EnergySublevel:
             if drawn > 1e7 and found < drawn * 1e-5:
                 raise ValueError(
                     f"`box` holds almost no state with energy below {self.energy:g} ({found} of {drawn} drawn): "
-                    f"{'raise `energy`, for the sublevel seems to be empty, or ' if not found else ''}"
+                    f"{'raise `energy`, because the sublevel seems to be empty, or ' if not found else ''}"
                     "make it fit the energy sublevel more closely."
                 )
         return np.concatenate(accepted)[:n]

@@ -63,7 +63,7 @@ def stated(
     argument: str,
     expression: Any,
     names: Collection[str] = (),
-    remedy: str = "Mend the text, or pass a SymPy expression",
+    remedy: str = "Correct the text, or pass a SymPy expression",
 ) -> sp.Expr:
     """The expression that an argument states, as text or SymPy's, in real symbols; refused where it cannot be read."""
     try:

@@ -34,7 +34,7 @@ class Friction:
         """Refuse compensated sums where there is friction."""
         if compensated and self:
             raise NotCompiled(
-                "`compensated` sums are for systems without friction, which forgets round-off: leave it out."
+                "`compensated` sums are for systems without friction, where rounding errors decay: leave it out."
             )
 
     def matrix(self, ndof: int) -> np.ndarray:

@@ -24,7 +24,7 @@ STEPS = {np.dtype(np.float64): (1e-5, 1e-4), np.dtype(np.float32): (3e-3, 1e-2)}
 FINER = [10.0**-k for k in range(1, 10)]
 """Fractions of the smaller step that are tried before a derivative is refused: a function may vary within the step."""
 FARTHER = 0.25  # a run is tested where it left the states tested before by this share of their extent
-REMEDY = "where all is as it should be, pass check=False to HamiltonianSystem."
+REMEDY = "if the function is correct, pass check=False to HamiltonianSystem."
 
 
 def probe_states(given: np.ndarray | None, domain: Domain | None, width: int) -> np.ndarray:

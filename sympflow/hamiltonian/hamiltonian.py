@@ -533,7 +533,7 @@ class Hamiltonian:
         form = self.form
         if form is None:
             why = f"its functions could not be traced: {self.untraced}" if self.untraced else "it is given by one piece"
-            raise ValueError(f"`system` {self.name!r} has no program, for {why}.")
+            raise ValueError(f"`system` {self.name!r} has no program, because {why}.")
         times = () if form.time is None else (form.time,)
         return recorded([form.H], (*times, *form.q, *form.p))
 

@@ -201,7 +201,7 @@ def check_continuous(
         x, at, below, above = found
         raise ValueError(
             f"`{argument}` jumps where {_named(border.g, names)} = 0, at {_named(x, names)} = {at:.6g} from "
-            f"{below:.6g} to {above:.6g}: the force there is a delta function, which no step meets. Let the pieces "
+            f"{below:.6g} to {above:.6g}: the force there is a delta function, which no step resolves. Let the pieces "
             "meet there, or write it as a continuous function, such as (1 + tanh((q - a)/w))/2 for a step at a of a "
             "width w that steps resolve; or, for a wall, solve from event to event and reflect p."
         )
@@ -478,7 +478,7 @@ def refuse_deltas(argument: str, f: sp.Basic, names: Mapping[sp.Symbol, str] | N
     for delta in f.atoms(sp.DiracDelta):
         raise ValueError(
             f"`{argument}` holds {_named(delta, names)}, and only impulses DiracDelta(t - a)*W(q), in H and of a named "
-            "time, have kicks: no step meets any other. Write it as a narrow smooth function, such as "
+            "time, have kicks: no step resolves any other. Write it as a narrow smooth function, such as "
             "exp(-(q/w)**2/2)/(w*sqrt(2*pi))."
         )
 

@@ -500,7 +500,7 @@ def checked_damping(values: float | ArrayLike | None, ndof: int) -> np.ndarray |
     if G.ndim < 2:
         if not (np.isfinite(G).all() and (G >= 0).all()):
             raise ValueError(
-                f"`damping` must be finite and not negative, for friction takes energy away; got {values!r}."
+                f"`damping` must be finite and not negative, because friction takes energy away; got {values!r}."
             )
     else:
         _check_symmetric("damping", G)
@@ -508,7 +508,7 @@ def checked_damping(values: float | ArrayLike | None, ndof: int) -> np.ndarray |
         rates = np.linalg.eigvalsh(G)
         if rates[0] < -8 * ndof * np.finfo(float).eps * abs(rates).max():
             raise ValueError(
-                "`damping` must be a positive semi-definite matrix, for friction takes energy away; its smallest "
+                "`damping` must be a positive semi-definite matrix, because friction takes energy away; its smallest "
                 f"eigenvalue is {rates[0]:g}."
             )
         if np.array_equal(G, np.diag(np.diag(G))):

@@ -508,7 +508,7 @@ def checked_planets(masses: Any, elements: Any, y0: Any, G: Any, units: Any) -> 
     """Masses, G and the state y0 that `HamiltonianSystem.planets` is given, tested."""
     G = plain(G)
     if G is not None and units is not None:
-        raise ValueError("`units` tell what `G` is: leave out one of them.")
+        raise ValueError("`units` determine `G`: give only one of them.")
     if G is not None and not (real_number(G) and 0 < G < math.inf):
         raise ValueError(f"`G` must be positive and finite; got {G!r}.")
     G = 1.0 if G is None and units is None else float(G) if units is None else gravity(units)
@@ -520,7 +520,7 @@ def checked_planets(masses: Any, elements: Any, y0: Any, G: Any, units: Any) -> 
     if not (masses >= 0).all():
         i = int(np.argmin(masses >= 0))
         raise ValueError(
-            f"`masses` must be positive, or 0 of bodies that are not felt; that of body {i} is {masses[i]:g}: "
+            f"`masses` must be positive, or 0 for bodies that exert no force; that of body {i} is {masses[i]:g}: "
             "change it."
         )
     if masses[1:].max() >= masses[0]:

@@ -1015,7 +1015,7 @@ class HamiltonianSystem(Hamiltonian, Answering):
         if not self.autonomous:
             kind += ", driven" if self.period is None else f", driven with period {self.period:g}"
         if self.definition.given_functions:
-            kind += f", arrays: it could not be traced, for {self.untraced}" if self.form is None else ", traced"
+            kind += f", arrays: it could not be traced, because {self.untraced}" if self.form is None else ", traced"
         degrees = f"{self.ndof:,} degree{'s' * (self.ndof > 1)} of freedom"
         named = f"{self.name}({params})" if self._name else self.title
         return f"<HamiltonianSystem {named}: {degrees}, {kind}>"

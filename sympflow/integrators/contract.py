@@ -295,7 +295,7 @@ class Integrator:
 
     def step(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
         """One step of signed length h from the states y (..., 2d)."""
-        raise TypeError(f"`method` {self.name!r} has no bare step: use solve().")
+        raise TypeError(f"`method` {self.name!r} cannot be stepped by itself: use solve().")
 
     def inverse(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
         """The state from which `step(system, t, ·, h)` leads to y."""

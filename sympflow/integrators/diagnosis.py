@@ -182,8 +182,8 @@ def note_poles(
     if likely:
         passage, which = found[likely[0]], _which(problem, likely, values)
         warn(
-            f"H{which} changed for good between t = {passage.begin:.10g} and {passage.end:.10g}, where a step leapt "
-            f"over a place at which it is infinite, {passage.place}: the run is meaningless after that. "
+            f"H{which} changed permanently between t = {passage.begin:.10g} and {passage.end:.10g}, where a step "
+            f"jumped over a place at which H is infinite, {passage.place}: the run is meaningless after that. "
             f"{_remedy(integrator, problem)}.",
             RuntimeWarning,
         )
@@ -216,7 +216,7 @@ def warn_of_collision(outcome: Outcome, integrator: Integrator, problem: Problem
     if len(met):
         warn(
             f"The solution{_which(problem, rows[met].tolist(), None)} becomes infinite, at about t = "
-            f"{times[met[0]]:.10g}, by a collision: no step leads beyond that, and the run turns there. End `t_span` "
+            f"{times[met[0]]:.10g}, by a collision: no step can pass it, and the run turns back there. End `t_span` "
             "before, or soften H.",
             RuntimeWarning,
         )
@@ -243,8 +243,8 @@ def warn_of_cancelling(outcome: Outcome, problem: Problem) -> None:
             continue
         _TOLD.add(poles)
         warn(
-            f"`system` has terms that cancel {each.name}: near it the force of this run is wrong in many "
-            "digits, and not finite at it. Write them by sinc, which is sin(x)/x without that, or near it by their "
+            f"`system` has terms that cancel {each.name}: near it many digits of the force are wrong in this run, and "
+            "at it the force is not finite. Write them by sinc, which is sin(x)/x without that, or near it by their "
             "series, in a Piecewise.",
             RuntimeWarning,
         )
@@ -403,7 +403,7 @@ def warn_of_long_steps(outcome: Outcome, integrator: Integrator, problem: Proble
     told = "the energy of the run " + ("overflows" if off == math.inf else f"is off by {100 * off:.2g} %")
     if off <= most and fixed and fixed.in_another_time and n_steps <= MOST_AGAIN:
         off, most = _end_off(outcome, fixed, problem), TOO_LOOSE
-        told = f"with half of it the run ends {100 * off:.2g} % of its size away"
+        told = f"with half of it the final state differs by {100 * off:.2g} % of its size"
     if off > most:
         what, remedy = "`rtol` is too large", "Take rtol=1e-8, or a method of fixed steps with tol=1e-6"
         if dt is not None:

@@ -146,8 +146,8 @@ def check_domain(outcome: Outcome, integrator: Integrator, system: HamiltonianSy
         worth = ""
         if flow is not None and not any(flow.evaluations(1, 1, 0, "array").values()):  # else forces of the system
             worth = (
-                ", where its network was not trained: it stays finite, even past a singularity, and what it gives from "
-                "that time on means nothing. Start inside the domain, or use a classical method"
+                ", where its network was not trained: it stays finite, even past a singularity, but its results "
+                "are meaningless from that time on. Start inside the domain, or use a classical method"
             )
         held = "the figures" if flow is None or flow.certified is None else "the figures and the certificate"
         outcome.message += f" {note}: {held} of a trained flow do not hold there{worth}."

@@ -559,7 +559,7 @@ class StoredRun(GridRun):
             at = np.fmin(at, before) if problem.t1 > problem.t0 else np.fmax(at, before)
             passed = np.where(np.isnan(at), piece.status, -1)
             piece.status, stats["failed_at"] = (passed, at) if at.ndim else (int(passed), float(at))
-            message = store.noted["passed"] + " What the store holds after that means nothing."
+            message = store.noted["passed"] + " The contents of the store after that are meaningless."
         place.counts["stats"] = stats
         store.finish(place, piece.status, message)
         return Outcome(*self._nothing, piece.status, message, stats, finite=True)

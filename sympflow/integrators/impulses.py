@@ -36,7 +36,7 @@ def landings(
     if dt is None and times:  # its steps may be longer than a pulse
         said = (
             f"`t_span` ({t0:g}, {t1:g}): H of {system.name!r} jumps in t, at t = {times[0]:.6g} and {len(times):,} "
-            f"times or more, where {integrator.name!r} ends no step: it is of first order there, or leaps over a "
+            f"times or more, where {integrator.name!r} ends no step: it is of first order there, or jumps over a "
             "pulse. Solve in shorter intervals, or by a fixed `dt` that divides all pieces between jumps."
         )
     elif dt is not None:

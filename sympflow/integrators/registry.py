@@ -227,8 +227,8 @@ def _made(method: Any, make: Callable[[], T]) -> T:
             kind = TypeError if isinstance(error, TypeError) else ValueError
             raise kind(f"{error} (Raised by {plugin}.)") from error
         raise RuntimeError(
-            f"`method` {method!r} of {plugin} failed when it was made ({type(error).__name__}: {error}): report it "
-            "there."
+            f"`method` {method!r} of {plugin} failed when it was made ({type(error).__name__}: {error}): report this "
+            "to its author."
         ) from error
 
 
@@ -252,12 +252,13 @@ def _load(point: EntryPoint) -> type[Integrator]:
         integrator = load_announced(point, "method")
     if not (isinstance(integrator, type) and issubclass(integrator, Integrator)):
         raise ImportError(
-            f"`method` {point.name!r} of the plug-in {distribution(point)} is not an Integrator class: report it there."
+            f"`method` {point.name!r} of the plug-in {distribution(point)} is not an Integrator class: report this to "
+            "its author."
         )
     if not named(integrator):
         raise ImportError(
             f"`method` {point.name!r} of the plug-in {distribution(point)} is a class without `name`, which every "
-            "integrator must have: report it there."
+            "integrator must have: report this to its author."
         )
     _loaded[integrator] = point
     return integrator
@@ -286,7 +287,7 @@ class naming_plugin:
             return
         raise RuntimeError(
             f"`method` {point.name!r} of the plug-in {distribution(point)} failed ({type(error).__name__}: {error}): "
-            "report it there, unless a function of your own, of the system or an event, raised it."
+            "report this to its author, unless a function of your own, of the system or an event, raised it."
         ) from error
 
 

@@ -47,7 +47,8 @@ class ExplicitStep(ByVectorField):
                 "`system` cannot be compiled: its vector field is not symbolic. Use HamiltonianSystem.from_sympy, or "
                 "use backend='array'."
                 if not system.untraced
-                else f"`system` cannot be compiled, for its functions could not be traced: {system.untraced}. Change "
+                else f"`system` cannot be compiled, because its functions could not be traced: {system.untraced}. "
+                "Change "
                 "them, or use HamiltonianSystem.from_sympy, or use backend='array'."
             )
         from sympflow.kernels import explicit_loops  # SymPy, which other systems do without
@@ -127,5 +128,5 @@ def hopeless(n_steps: int, t0: float, t: float, t1: float, most: int) -> str | N
         f"After {n_steps:,} steps t = {t:.15g} is reached, and at this pace the end needs about {pace:.1g} more; "
         f"`max_steps` is {most:,}. Raise it, or `max_step` or the tolerances, or end `t_span` earlier; a fixed-step "
         "method may do with fewer steps. Where the motion is slow, such short steps mean that the force is rough: "
-        "terms of H that cancel lose digits, and are to be written otherwise."
+        "terms of H that cancel lose digits: rewrite them."
     )

@@ -77,7 +77,7 @@ class Stepper:
         y0, untraced = problem.y0, None if kernel is not None or problem.system is None else problem.system.untraced
         if untraced and problem.backend == "auto" and y0.dtype == np.float64:
             name = "potential" if problem.system.separable else "hamiltonian"
-            self.why = f": `{name}` could not be traced, for {untraced}"
+            self.why = f": `{name}` could not be traced, because {untraced}"
         if told and problem.system.symbols is not None:
             self.remark = f" Its steps were array operations: {_ADVICE.sub('.', told[0])}"
         elif told and problem.system.form is not None:  # functions that were traced
@@ -193,7 +193,7 @@ def checked_state(y_next: Any, y: Array) -> Array:
     what = "" if shape is None else f" of {y_next.dtype} and shape {tuple(shape)}"
     raise TypeError(
         f"`step` must return states as those that it is given, of {y.dtype} and shape {tuple(y.shape)}; got "
-        f"{type(y_next).__name__}{what}. Mend the integrator: check_integrator tests it."
+        f"{type(y_next).__name__}{what}. Correct the integrator: check_integrator tests it."
     )
 
 

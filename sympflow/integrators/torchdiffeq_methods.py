@@ -384,8 +384,8 @@ class Adaptive(Watched, RungeKutta):
     def tangent(self, system: HamiltonianSystem, t: float, y: Array, h: Array) -> tuple[np.ndarray, np.ndarray]:
         if self.tableau.carries_slope:
             raise TypeError(
-                f"`method` {self.name!r} is not a one-step map in torchdiffeq, which carries a slope over: "
-                "volume and symplecticity have no meaning for it. Use 'heun2', or 'dopri5'."
+                f"`method` {self.name!r} is not a one-step map in torchdiffeq, which reuses a slope of the step "
+                "before: volume and symplecticity have no meaning for it. Use 'heun2', or 'dopri5'."
             )
         return super().tangent(system, t, y, h)
 

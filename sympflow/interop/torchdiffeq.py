@@ -366,7 +366,7 @@ def _landing(
         more = " after that too" if "jump_t" in known else ""
         warn(
             f"`func` {func.name!r} jumps in t, at t = {found.max() if more else found.min():.6g}{more}, where "
-            f"{name!r} of torchdiffeq ends no step: it is of first order there, or leaps over a pulse. Take a "
+            f"{name!r} of torchdiffeq ends no step: it is of first order there, or jumps over a pulse. Take a "
             "Runge–Kutta method over fewer jumps, or one of ours by sympflow.solve.",
             RuntimeWarning,
         )
@@ -439,7 +439,9 @@ def _announced(
     if callback is None:
         return None
     if not (readable(y0) and readable(t)):
-        raise TypeError("`callback_step` is handed one state and time, which torch.func.vmap has not: remove it.")
+        raise TypeError(
+            "`callback_step` is called with one state and time, which do not exist inside torch.func.vmap: remove it."
+        )
     start = t[0].detach()
 
     def before_step(s: float, y: Tensor, h: float) -> None:
@@ -575,8 +577,9 @@ class _Solver:
         if _within_adjoint():
             raise ValueError(
                 f"`method` {self.method!r} cannot be used with torchdiffeq's own odeint_adjoint, which integrates the "
-                "derivative of `func` backward: that is not the derivative of the map that was run, and never sees a "
-                "flow's weights. Use odeint_adjoint of sympflow.interop.torchdiffeq, whose gradients are those of the "
+                "derivative of `func` backward: that is not the derivative of the map that was run, and gives a "
+                "flow's weights no gradient. Use odeint_adjoint of sympflow.interop.torchdiffeq, whose gradients are "
+                "those of the "
                 "map."
             )
         self.direction, shapes, announced = 1, None, func

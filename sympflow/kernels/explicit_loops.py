@@ -69,7 +69,7 @@ class Field:
         assert symbols is not None
         self.large = is_large(symbols) and force is None
         if force is not None and names:
-            raise NotCompiled("`system` has a force that is none of H.")
+            raise NotCompiled("`system` has a force that does not derive from H.")
         symbols = parametric(symbols, names)
         self.lettered = lettered(symbols, [symbols.H, *forces])
         self.ndof = system.ndof

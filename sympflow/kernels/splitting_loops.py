@@ -148,7 +148,8 @@ class SplittingLoops:
             self._compile = partial(LayeredCode, system.layered)
         else:
             raise NotCompiled(
-                f"`system` cannot be compiled, for its functions could not be traced: {system.untraced}. Change them, "
+                f"`system` cannot be compiled, because its functions could not be traced: {system.untraced}. Change "
+                "them, "
                 "or define it with HamiltonianSystem.from_sympy, or use backend='array'."
             )
         self._system: ref[HamiltonianSystem] | None = ref(system)  # which keeps these loops

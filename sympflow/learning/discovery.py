@@ -839,9 +839,11 @@ def _of_flow(
 
     found = domain or (flow.domain_for(flow.system) if flow.system is not None else flow.domain)
     if found is None:
-        raise ValueError("`domain` is needed, for the flow has none: give a Box of the states it was trained on.")
+        raise ValueError("`domain` is needed, because the flow has none: give a Box of the states it was trained on.")
     if isinstance(found, EnergySublevel) and found.hamiltonian is None:
-        raise ValueError("`domain` is needed, for the flow's own is by the energy of its system: pass system.domain.")
+        raise ValueError(
+            "`domain` is needed, because the flow's own is defined by the energy of its system: pass system.domain."
+        )
     x = found.sample(COMPARED, seed)
     nodes, weights = np.polynomial.legendre.leggauss(5)
     with torch.no_grad():

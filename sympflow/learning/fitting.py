@@ -272,8 +272,8 @@ class Held:
             return f"they are {self.excess:.1f} times the noise that is seen without a model"
         if self.loudness >= LOUDER:
             return (
-                f"they are {self.loudness:.1f} times the noise, as it was given or as the trajectories that the model "
-                "was fitted to show it"
+                f"they are {self.loudness:.1f} times the noise, as given, or as found in the trajectories that the "
+                "model was fitted to"
             )
         return f"the correlation of one with {self.later} is {self.correlation:.2f}"
 

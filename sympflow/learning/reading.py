@@ -175,7 +175,7 @@ def of_mapping(data: Mapping[str, Any], ndof: int | None, time: str | None, q: A
     made = [a[:, None] if a.ndim == 2 and runs else a for a in halves if a is not None]
     if made[0].ndim == 2 and ndof is None:
         raise ValueError(
-            f"{said}: of q (k, n) it cannot be told whether these are k coordinates or k trajectories: pass `ndof`."
+            f"{said}: it is ambiguous whether q of shape (k, n) holds k coordinates or k trajectories: pass `ndof`."
         )
     return t, np.concatenate(made, axis=-2)
 
@@ -282,7 +282,7 @@ def _loaded(data: Any) -> Any:
     """The Dataset in memory, unless what its file tells of would not fit there."""
     if data.nbytes > 8 * MAX_ASKED_VALUES:
         raise ValueError(
-            f"`data` tells of {data.nbytes / 2**30:.3g} GiB, more than {MAX_ASKED_VALUES:.0e} numbers: give a part."
+            f"`data` has {data.nbytes / 2**30:.3g} GiB, more than {MAX_ASKED_VALUES:.0e} numbers: give a part."
         )
     return data.load()
 

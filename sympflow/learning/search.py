@@ -231,7 +231,7 @@ class Search:
         because = (
             "its residuals on held-out trajectories are no more than rounding"
             if held.exact
-            else "it explains held-out trajectories best, and its residuals are noise: one tells nothing of "
+            else "it explains held-out trajectories best, and its residuals are noise: one says nothing about "
             f"{held.later}"
             if held.explained
             else f"it explains held-out trajectories best; but its residuals are not noise: {held.complaint}"
@@ -421,9 +421,9 @@ class Search:
             share = float(np.min(self.best[1].sigma / self.data.scales))
             if share > fitting.SILENT:
                 warn(
-                    f"The best model, {candidate.name}, explains next to nothing: the noise that it leaves is "
-                    f"{share:.0%} of the spread of every coordinate or more. Points may be in no order, of other "
-                    "trajectories or too far apart; else there is only noise."
+                    f"The best model, {candidate.name}, explains almost nothing: its residuals are "
+                    f"{share:.0%} of the spread of every coordinate or more. The points may be out of order, of "
+                    "different trajectories or too far apart; otherwise the data are noise."
                 )
             elif self.unseen:
                 warn(remark_on(self.unseen))
@@ -443,7 +443,7 @@ class Search:
         free = None if deadline.over() else self.freedom(replace(self.setting, stop=deadline.over))
         if free is not None:
             what = "H without the time" if free.defect < SYMPLECTIC else "symplectic map"
-            said += f" No {what} explains these data: {free.said} leaves {free.share:.1e} of the squares."
+            said += f" No {what} explains these data: {free.said} leaves {free.share:.1e} of the sum of squares."
             if free.defect >= SYMPLECTIC:
                 said += (
                     f" Its Jacobian L fails the test of symplecticity: LᵀJ + JL, which is 0 for a Hamiltonian, is "

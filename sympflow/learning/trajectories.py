@@ -325,7 +325,7 @@ class Trajectories(Answering):
         if len(self.runs) < 2:
             raise ValueError(
                 "`data` has one trajectory only, of which none can be held out: add others, or cut it by `.pieces`, "
-                "which shows less, for its pieces lie on one orbit."
+                "which shows less, because its pieces lie on one orbit."
             )
         count = min(max(round(share * len(self.runs)), 1), len(self.runs) - 1)
         drawn = set(np.random.default_rng(seed).permutation(len(self.runs))[:count].tolist())

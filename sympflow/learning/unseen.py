@@ -80,8 +80,8 @@ def remark_on(functions: Sequence[sp.Expr]) -> str:
     """The same in words."""
     listed = ", ".join(map(str, functions[:3]))
     return (
-        f"The data do not tell H beyond themselves: at all of their points, to the noise, {listed} "
-        f"{'is' if len(functions) == 1 else 'are'} the same, and what H does elsewhere is a guess. The domain is a "
+        f"The data do not determine H elsewhere: at all of their points, within the noise, {listed} "
+        f"{'is' if len(functions) == 1 else 'are'} the same, so that H elsewhere is a guess. The domain is a "
         "tube around the longest trajectory. Add trajectories in which that differs."
     )
 

@@ -61,7 +61,7 @@ class Frequencies(OfOrbits):
         n = self.frequencies.shape[-1]
         lines, sizes = self.frequencies.reshape(-1, n), np.abs(self.amplitudes).reshape(-1, n)
         if not np.isfinite(lines).any():
-            raise ValueError("`plot` has nothing to draw, for no line was found: `message` says why.")
+            raise ValueError("`plot` has nothing to draw, because no line was found: `message` says why.")
         return curves_figure(lines, sizes, ("angular frequency", "amplitude"), self.caption, bars=True)
 
 

@@ -213,8 +213,8 @@ class Store:
         if mine.untold and not same:
             name, part = next(iter(mine.untold.items()))
             raise ValueError(
-                f"`store` {asked!r} may be of another {kind}: `{name}` holds {part}, which cannot be told from others. "
-                "Pass same=True if all is the same, or name another folder."
+                f"`store` {asked!r} may be of another {kind}: `{name}` holds {part}, which cannot be distinguished "
+                "from others. Pass same=True if all is the same, or name another folder."
             )
 
     def check_made_of(self, fields: Mapping[str, Field]) -> None:
@@ -485,6 +485,6 @@ def _told(path: Path) -> Iterator[None]:
         if isinstance(error, StoreError):
             raise
         raise StoreError(
-            f"`store` {str(path)!r} cannot be written ({error.strerror or error}): what was committed is kept. Make "
-            "room, or mend that, and resume."
+            f"`store` {str(path)!r} cannot be written ({error.strerror or error}): what was committed is kept. Free "
+            "some space, or remove that cause, and resume."
         ) from error

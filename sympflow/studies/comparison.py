@@ -180,9 +180,9 @@ def _check_apply(system: HamiltonianSystem, asked: Sequence[str], match: str | N
     if unkept or match == "energy_error":
         what = f"which `metrics` {', '.join(map(repr, unkept))}" if unkept else "which `match` 'energy_error'"
         remedy = f"leave `metrics` out, or pass {list(default_metrics(system))}, and match by 'time'"
-        system.check_conservative(f"{what} presume is not there", remedy)
+        system.check_conservative(f"{what} would measure is not conserved", remedy)
         if match == "energy_error" or not {"energy", "drift"}.isdisjoint(unkept):
-            system.check_autonomous("so that its energy is not kept", f"{remedy}: 'balance' is that of its energy")
+            system.check_autonomous("so that its energy is not conserved", f"{remedy}: 'balance' is that of its energy")
 
 
 def _identify(system: HamiltonianSystem) -> str:

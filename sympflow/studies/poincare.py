@@ -149,7 +149,7 @@ def states_of_energy(system: HamiltonianSystem, energy: float, n: int, plane: Pl
     ValueError
         If the system is driven, or no state of this energy is found.
     """
-    system.check_autonomous("so no `energy` is that of an orbit", "pass `y0`")
+    system.check_autonomous("so that no orbit has a constant `energy`", "pass `y0`")
     checked_number("energy", energy, "a finite number, a value of H")
     check_counts(n=n)
     d, rng, factors = system.ndof, np.random.default_rng(seed), weights(system)
@@ -205,7 +205,8 @@ def _checked_period(system: HamiltonianSystem, period: float | None, plane: list
     if period is not None:
         if plane:
             raise ValueError(
-                f"`period` and `{plane[0]}` ask for two kinds of section, after each period and in a plane: give one."
+                f"`period` and `{plane[0]}` choose two kinds of section, after each period and in a plane: give one "
+                "of them."
             )
         check_positive("period", period)
         return float(period)

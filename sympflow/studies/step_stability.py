@@ -328,7 +328,9 @@ class Study:
         worst = one.row.energy_error if one.row.energy_error is not None else math.inf
         exit_time = domain_exit(one.sols) if self.integrator.trained else None
         left = (
-            "" if exit_time is None else f"Left the flow's domain at t = {exit_time:.6g}, where the flow says nothing."
+            ""
+            if exit_time is None
+            else f"Left the flow's domain at t = {exit_time:.6g}, outside of which the flow is not valid."
         )
         if left or not worst <= self.bound:
             return ("unstable" if not worst <= self.bound else "outside"), left

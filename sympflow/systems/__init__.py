@@ -139,7 +139,7 @@ def _load(key: str, point: "EntryPoint") -> Callable[..., HamiltonianSystem]:
     if isinstance(factory, HamiltonianSystem) or not _makes_a_default(factory):
         raise ImportError(
             f"`system` {key!r} of the plug-in {distribution(point)} is not a function with a default for every "
-            "parameter: report it there."
+            "parameter: report this to its author."
         )
     return factory
 

@@ -92,7 +92,7 @@ def factory(path: str | os.PathLike[str], name: str | None = None) -> Callable[.
     try:
         module = _run(file.resolve())
     except (Exception, SystemExit) as error:
-        raise ValueError(f"`system` {str(file)!r} cannot be run ({_described(error, file)}): mend it.") from error
+        raise ValueError(f"`system` {str(file)!r} cannot be run ({_described(error, file)}): correct it.") from error
     if name is None:
         names = _candidates(module)
         if len(names) == 1:
@@ -136,9 +136,11 @@ def _answering(function: Callable[..., Any], name: str, file: Path) -> Callable[
         try:
             system = function(**params)
         except (Exception, SystemExit) as error:
-            raise ValueError(f"{where} failed ({_described(error, file)}): mend it.") from error
+            raise ValueError(f"{where} failed ({_described(error, file)}): correct it.") from error
         if not isinstance(system, HamiltonianSystem):
-            raise ValueError(f"{where} must return a HamiltonianSystem; it returns {type(system).__name__}: mend it.")
+            raise ValueError(
+                f"{where} must return a HamiltonianSystem; it returns {type(system).__name__}: correct it."
+            )
         return _named(system, f"{file.name}:{name}")
 
     return make
@@ -171,7 +173,7 @@ def _table(file: Path) -> dict[str, Any]:
     except RecursionError:
         raise ValueError(f"`system` {str(file)!r} is nested too deeply: write it in fewer brackets.") from None
     except ValueError as error:  # of its grammar, and of numbers with thousands of digits
-        raise ValueError(f"`system` {str(file)!r} is not TOML ({error}): mend it, texts in quotes.") from error
+        raise ValueError(f"`system` {str(file)!r} is not TOML ({error}): correct it; texts stand in quotes.") from error
     for key, value in table.items():
         if key not in KEYS:
             hint = did_you_mean(key, KEYS)
@@ -213,7 +215,7 @@ def _domain(table: dict[str, Any], file: Path) -> Ball | Box | EnergySublevel | 
     unknown = [key for key in table if key not in ("kind", *DOMAINS[kind])]
     if unknown:
         has = ", ".join(DOMAINS[kind])
-        raise ValueError(f"`domain` has a key {unknown[0]!r}, but a {kind} has {has} (in {str(file)!r}): mend it.")
+        raise ValueError(f"`domain` has a key {unknown[0]!r}, but a {kind} has {has} (in {str(file)!r}): correct it.")
     if isinstance(table.get("box"), dict):
         table = table | {"box": {"kind": "Box"} | table["box"]}
     try:

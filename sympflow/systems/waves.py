@@ -312,7 +312,7 @@ def toda_chain(n: int = 128, kappa: float = 0.5) -> HamiltonianSystem:
     .. [1] M. Toda, "Theory of Nonlinear Lattices", 2nd ed., Springer 1989, 2.2 and 3.4.
     """
     n, k = _sites(n, 2), positive("kappa", kappa)
-    checked_number("kappa", k, "at most 20, for the soliton is otherwise less than a site wide", lambda x: x <= 20)
+    checked_number("kappa", k, "at most 20, because otherwise the soliton is narrower than a site", lambda x: x <= 20)
     speed = math.sinh(k) / k
     high = np.repeat([1.5 * k, 3 * k * speed * math.sinh(k) + 1e-3], n)
     return _system(

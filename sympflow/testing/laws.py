@@ -402,7 +402,7 @@ def statistics(integrator: Integrator, system: HamiltonianSystem) -> None:
         expected = math.ceil(T_END / integrator.step_length(system))
         assert stats["n_steps"] == expected, f"stats count {stats['n_steps']} steps of {expected}"
     if not integrator.trained:
-        assert stats["force_evaluations"] > 0, "stats count no force: let them be counted, or mend `evaluations`"
+        assert stats["force_evaluations"] > 0, "stats count no force: count them, or correct `evaluations`"
         _the_count_of_a_step(integrator, system)
     longer = run(integrator, system, (0.0, 3 * T_END)).stats
     for key in ("n_steps", "force_evaluations", "hessian_evaluations"):
@@ -421,7 +421,7 @@ def _the_count_of_a_step(integrator: Integrator, system: HamiltonianSystem) -> N
         integrator.step(view, 0.0, y, 0.1)
     told = integrator.evaluations(0, 0, 1, "numpy")["force_evaluations"]
     n = made["force_evaluations"]
-    assert n in (0, told), f"`evaluations` tells {told} forces a step, but step() evaluates {n}"
+    assert n in (0, told), f"`evaluations` states {told} forces a step, but step() evaluates {n}"
 
 
 OF_RUNS: tuple[Callable[[Integrator, HamiltonianSystem], None], ...] = (

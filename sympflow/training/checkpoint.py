@@ -59,7 +59,7 @@ def check_writable(path: str | os.PathLike[str]) -> None:
     if path.is_dir():
         why = "it is a folder"
     elif why is None and not os.access(path.parent, os.W_OK):
-        why = "its folder is not to be written to"
+        why = "its folder is write-protected"
     if why is not None:
         raise ValueError(f"`checkpoint` {str(path)!r} cannot be written ({why}): name a file that can be.")
 
@@ -83,10 +83,10 @@ def read(path: str | os.PathLike[str]) -> dict[str, Any]:
         state = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # torch raises whatever its unpickler and archive reader raise
         raise ValueError(
-            f"`resume` {str(path)!r} is not a checkpoint ({type(error).__name__}): start afresh."
+            f"`resume` {str(path)!r} is not a checkpoint ({type(error).__name__}): start a new run."
         ) from error
     if not isinstance(state, dict) or set(state) != FIELDS:
-        raise ValueError(f"`resume` {str(path)!r} is not a checkpoint of sympflow: start afresh.")
+        raise ValueError(f"`resume` {str(path)!r} is not a checkpoint of sympflow: start a new run.")
     if state["format"] != FORMAT:
         raise ValueError(f"`resume` {str(path)!r} has format {state['format']!r}, not {FORMAT}: update sympflow.")
     return state

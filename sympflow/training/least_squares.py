@@ -311,7 +311,7 @@ class GaussNewtonSteps:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         n, scale = sum(w.numel() for w in self.parameters), state["scale"]
         if scale is not None and scale.shape != (n,):
-            raise ValueError(f"`state` has a scale of shape {tuple(scale.shape)}, not {(n,)}: start afresh.")
+            raise ValueError(f"`state` has a scale of shape {tuple(scale.shape)}, not {(n,)}: start a new run.")
         self.scale = None if scale is None else scale.to(self.parameters[0])
         self.damping = Damping(state["damping"], LEAST_DAMPING_OF_WEIGHTS, state["growth"])
         self.costs, self.draw, self.finished = list(state["costs"]), state["draw"], state["finished"]

@@ -114,7 +114,9 @@ class BFGSSteps:
         B = state["inverse_hessian"]
         n = sum(w.numel() for w in self.parameters)
         if B is not None and B.shape != (n, n):
-            raise ValueError(f"`state` has an inverse Hessian of shape {tuple(B.shape)}, not {(n, n)}: start afresh.")
+            raise ValueError(
+                f"`state` has an inverse Hessian of shape {tuple(B.shape)}, not {(n, n)}: start a new run."
+            )
         self.B = None if B is None else B.to(self.parameters[0])
 
     def step(self, index: int, loss: Callable[[], Tensor]) -> float:

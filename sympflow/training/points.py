@@ -342,9 +342,11 @@ def warn_of_another_system(data: Labelled, system: HamiltonianSystem) -> None:
     away = away[np.isfinite(away)]
     if len(away) and np.median(away) >= 0.1 * np.median(moved) and np.median(away) > COMPARED_TO:
         warn(
-            f"`data` are not labels of the system {system.name!r}: its exact flow takes the labelled states elsewhere, "
-            f"in the median {np.median(away) / max(np.median(moved), 1e-300):.1e} times as far as they move. Figures "
-            "such as one_step_error compare with H of the system, and say nothing of your data: give its own system."
+            f"`data` are not labels of the system {system.name!r}: they differ from its exact flow, "
+            f"in the median {np.median(away) / max(np.median(moved), 1e-300):.1e} times as much as the states move. "
+            "Figures "
+            "such as one_step_error compare with H of the system, and do not describe your data: pass the system that "
+            "they come from."
         )
 
 

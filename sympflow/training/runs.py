@@ -218,7 +218,7 @@ class Run(ABC):
         try:
             self.restore(state)
         except (RuntimeError, KeyError, ValueError) as error:
-            raise ValueError(f"`resume` {str(path)!r} does not fit the flow: start afresh.") from error
+            raise ValueError(f"`resume` {str(path)!r} does not fit the flow: start a new run.") from error
         self.seconds, self.history = state["seconds"], state["history"]
 
 

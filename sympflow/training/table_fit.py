@@ -100,9 +100,7 @@ class TableRun(SearchRun):
         self.step = step = TableStep(system, flow.sequence, flow.tables.level, flow.monomials, compiled=True)
         unit = np.array(scaling.x)
         if options.residual_weight or options.matching_weight or data is not None:
-            system.check_autonomous(
-                "and what is not its own labels tells no time at which a step begins", "leave out `loss` and `data`"
-            )
+            system.check_autonomous("and only its own labels say when a step begins", "leave out `loss` and `data`")
         parts: list[tuple[float, Problem]] = []
         self.frozen: TableFit | None = None
         self.weighted: TableFit | None = None

@@ -164,7 +164,7 @@ def train(
     if fit is None or not isinstance(fit, Fit):
         fit, solver, start = _described(system, fit, solver, flow, fits.said(options))
     elif options:
-        raise TypeError(f"`{next(iter(options))}` was given beside `fit`: make it an option of that.")
+        raise TypeError(f"`{next(iter(options))}` was given in addition to `fit`: make it an option of `fit`.")
     return fit_flow(system, flow, fit, solver, domain, session, start)
 
 
@@ -182,7 +182,9 @@ def fit_flow(
         of_steps = {"solver": solver, "checkpoint": session.checkpoint, "resume": session.resume}
         for name, value in {**of_steps, "callback": session.callback}.items():
             if value is not None:
-                raise TypeError(f"`{name}` is of fits in steps, and {type(fit).__name__} has none: leave it out.")
+                raise TypeError(
+                    f"`{name}` is for fits that run in steps, and {type(fit).__name__} does not: leave it out."
+                )
     if isinstance(fit, KeplerFit):  # along an orbit, which needs no domain
         _checked_kind(system, flow, fit)
         return train_planets(system, fit, domain or system.domain, session)
@@ -371,7 +373,7 @@ def _described(
         start = PrimedFit(**{n: options.pop(n) for n in PrimedFit.of_flow() if n in options})
     made, found = fits.from_keywords(options, kind, by, flow)
     if solver is not None and (twice := [name for name in options if name in found.names()]):
-        raise TypeError(f"`{twice[0]}` was given beside `solver`: make it an option of that.")
+        raise TypeError(f"`{twice[0]}` was given in addition to `solver`: make it an option of `solver`.")
     return made, found if solver is None else solver, start
 
 

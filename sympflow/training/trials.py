@@ -158,8 +158,9 @@ def _warn_if_cut(session: Session, n_tried: int, wanted: Collection[PrimedFit]) 
     """Warn where the time ended the trials, not Ctrl-C: the flow may be far from what `train` finds else."""
     if n_tried < len(wanted) and not session.interruption.asked:
         warn(
-            f"`time_budget`: the share for trials of {session.time_budget:g} s was over, as on a busy machine, after "
-            f"{n_tried} of {len(wanted)} or more flows; another one may take far less time than that which is fitted. "
+            f"`time_budget`: of {session.time_budget:g} s the share for trials ended, as on a busy machine, after "
+            f"{n_tried} of {len(wanted)} or more flows; one that was not tried may be much faster than the one that "
+            "is fitted. "
             "Give a longer `time_budget`.",
             RuntimeWarning,
         )

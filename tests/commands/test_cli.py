@@ -173,13 +173,13 @@ def test_missing_matplotlib_is_reported_before_anything_is_computed(command, tmp
         (["solve", "pendulum", "--method", "none.safetensors"], "`--method` 'none.safetensors' is not a file: name a"),
         (["solve", "pendulum", "--method", "rk45:dt=0.1"], "`dt` is not an option of method 'rk45'"),  # as written
         (["solve", "nonseparable", "--method", "verlet"], "use an implicit method such as 'gauss_legendre6'"),
-        (["compare", "pendulum", "--backend", "fast"], "'fast' is none of auto, compiled, array"),
+        (["compare", "pendulum", "--backend", "fast"], "'fast' is not one of auto, compiled, array"),
         (["bench", "own.toml"], "`system` 'own.toml': there is no such file"),
         (["section", "pendulum", "--direction", "left"], "`--direction` must be one of up, down, both"),
         (["section", "pendulum", "--axes", "q"], "`--axes` must be two of q, p"),
         (
             ["section", "kicked", "--period", "2", "--level", "0"],
-            "`--period` and `--level` ask for two kinds of section",
+            "`--period` and `--level` choose two kinds of section",
         ),
         (["section", "pendulum", "--coordinate", "z"], "`--coordinate` must be one of q, p"),
         (["section", "pendulum", "--orbits", "2", "--y0", "1,0"], "`--orbits` and `--y0` both choose"),

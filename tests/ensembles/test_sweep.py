@@ -247,7 +247,7 @@ def test_energy_errors_where_some_values_drive_the_system():
         return sympflow.ensemble(system, "verlet", (0, 1), [[1.0, 0.0], [0.0, 1.0]], **how)
 
     for values in ([0.0, 0.1], [0.1, 0.0]):
-        with pytest.raises(ValueError, match=r"`system` .* is driven, H depends on t, so its energy is not kept"):
+        with pytest.raises(ValueError, match=r"`system` .* is driven, H depends on t, so its energy is not conserved"):
             swept(a=values)
     result = swept(a=[0.3, 0.2], b=[0.3])
     assert result.status.tolist() == [[[0, 0]], [[-1, -1]]]

@@ -128,7 +128,7 @@ GOOD = SympFlow(1, pairs=1, hidden=(3, 2)).to_potentials()[0]
         (
             ("kick", nn.Sequential(nn.Linear(2, 3), nn.ELU(alpha=0.5), nn.Linear(3, 1))),
             ValueError,
-            r"an activation ELU\(alpha=0.5\) that is none of tanh, .*: register it by",
+            r"an activation ELU\(alpha=0.5\) that is not one of tanh, .*: register it by",
         ),
         (3, TypeError, r"it must be a mapping, or a pair of a kind and a torch.nn.Sequential"),
     ],

@@ -90,7 +90,7 @@ def test_a_network_outside_its_domain_says_that_it_means_nothing_there(flow, bat
     assert np.all(sol.status == 0)
     assert sol.stats["domain_exit"] == 0.0
     assert "where its network was not trained" in sol.message
-    assert "means nothing. Start inside the domain" in sol.message
+    assert "meaningless from that time on. Start inside the domain" in sol.message
     assert "means nothing" not in solve(HH, method, (0, 7), 0.5 * HH.y0, flow=flow).message
     stopped = solve(HH, method, (0, 7), y0, flow=flow, on_domain_exit="stop")
     np.testing.assert_array_equal(stopped.status, [-1, 0] if batch else -1)

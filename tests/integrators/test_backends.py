@@ -24,7 +24,7 @@ AIRY = HamiltonianSystem.from_sympy("p**2/2 - airyai(q)", y0=[1.0, 0.0])
         (HH, {"y0": torch.tensor(HH.y0), "backend": "array"}, "torch"),
         (HH, {"backend": "array"}, "numpy"),
         (TRACED, {}, "compiled"),
-        (PLAIN, {}, "numpy: `potential` could not be traced, for numpy.median has no rule"),
+        (PLAIN, {}, "numpy: `potential` could not be traced, because numpy.median has no rule"),
         (AIRY, {}, "numpy"),
     ],
 )

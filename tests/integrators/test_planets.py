@@ -183,7 +183,7 @@ BAD = [
     ({"elements": {"a": [1, 2, 3], "inc": [7.0, 0, 0]}}, "`elements` of planet 1 .* radians"),
     ({"elements": {"a": [1, 2, np.nan]}}, "`elements` of planet 3 .* finite"),
     ({"G": -1.0}, "`G` must be positive"),
-    ({"units": "AU, day, solar mass"}, "`units` tell what `G` is"),
+    ({"units": "AU, day, solar mass"}, "`units` determine `G`"),
     ({"G": None, "units": "AU, day"}, "`units` must be 'SI', or names of a length"),
     ({"G": None, "units": "parsec, day, kg"}, "The names are m, km, AU; s, day, year; kg, solar mass"),
     ({"G": None, "units": ("AU", "fortnight", "kg")}, "got .'AU', 'fortnight', 'kg'"),

@@ -77,7 +77,7 @@ def test_multistep_methods_are_torchdiffeqs_and_have_no_step(method):
     options, ends = {"step_size": 0.02, "max_order": 4}, torch.tensor([0.0, 1.0], dtype=torch.float64)
     theirs = odeint(HH, torch.tensor(HH.y0), ends, method=method, options=options)
     np.testing.assert_allclose(solve(HH, method, (0, 1), dt=0.02).y[:, -1], theirs[-1].numpy(), atol=1e-9)
-    with pytest.raises(TypeError, match=r"^`method` .* has no bare step"):
+    with pytest.raises(TypeError, match=r"^`method` .* cannot be stepped by itself"):
         get(method)().step(HH, 0.0, HH.y0, 0.1)
 
 

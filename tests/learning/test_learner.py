@@ -518,7 +518,7 @@ def test_a_flow_of_data_that_do_not_tell_h_is_of_these_data():
     t = np.linspace(0, 6, 31)
     angle = np.linspace(0, 5, 10)[:, None] + t
     y = np.stack([np.cos(angle), np.sin(angle), -np.sin(angle), np.cos(angle)], 1)
-    with pytest.warns(UserWarning, match=r"do not tell H beyond themselves: .* q1\*\*2 \+ q2\*\*2 is the same"):
+    with pytest.warns(UserWarning, match=r"do not determine H elsewhere: .* q1\*\*2 \+ q2\*\*2 is the same"):
         flow = sympflow.learn((t, y), time_budget=20)
     assert flow.domain.contains(y[0].T).all()
     assert not flow.domain.contains(np.zeros((1, 4))).any()
@@ -544,7 +544,7 @@ def test_noise_alone_and_a_noise_that_is_too_small_are_called_so():
     data = Trajectories.read((t, random.normal(size=(6, 2, 21))))
     search = Search(data, [data.split(0.2, 0)], _constraints(data, None, None, False, None, None), Setting(), 0)
     search.run(["polynomial"], Session())
-    with pytest.warns(UserWarning, match="explains next to nothing"):
+    with pytest.warns(UserWarning, match="explains almost nothing"):
         search.diagnose(Session())
     data = Trajectories.read(trajectories(6, 12, noise=0.02))
     held = judged(fitted(quartic(data), data, Setting(np.full(2, 0.002))), data, Setting(np.full(2, 0.002)))

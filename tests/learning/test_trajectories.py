@@ -120,7 +120,7 @@ def test_tables_and_datasets_are_read_by_their_names(tmp_path, monkeypatch):
     sol.to_xarray().assign(more=("x", np.zeros(3))).to_zarr(large, consolidated=False, zarr_format=2)
     described = json.loads((large / "more" / ".zarray").read_text())
     (large / "more" / ".zarray").write_text(json.dumps(described | {"shape": [10**13]}))
-    with pytest.raises(ValueError, match=r"^`data` tells of 7\.45e\+04 GiB, more than 1e\+09 numbers: give a part\.$"):
+    with pytest.raises(ValueError, match=r"^`data` has 7\.45e\+04 GiB, more than 1e\+09 numbers: give a part\.$"):
         Trajectories.read(large)
     with pytest.raises(ValueError, match=r"names a file \.mat: \.csv, \.parquet, \.npz, \.nc and"):
         (tmp_path / "runs.mat").touch()

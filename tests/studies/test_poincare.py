@@ -138,8 +138,8 @@ def test_a_stroboscopic_section_has_the_states_after_whole_periods(method, optio
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ({"period": 1.0, "coordinate": 0}, r"^`period` and `coordinate` ask for two kinds"),
-        ({"period": 1.0, "direction": 1}, r"^`period` and `direction` ask for two kinds"),
+        ({"period": 1.0, "coordinate": 0}, r"^`period` and `coordinate` choose two kinds"),
+        ({"period": 1.0, "direction": 1}, r"^`period` and `direction` choose two kinds"),
         ({"period": -1.0}, r"^`period` must be positive"),
         ({"t_span": (0, 1)}, r"^`t_span` \(0, 1\) is shorter than the period"),
     ],

@@ -87,7 +87,7 @@ def test_a_flow_outside_its_domain_is_not_called_stable():
     report = stability(systems.henon_heiles(), [network], metrics=("energy",), **arguments)
     (row,), (limit,) = report.rows, report.limits
     assert row.status == "outside"
-    assert re.search(r"Left the flow's domain at t = [\d.]+, where the flow says nothing\.", row.reason)
+    assert re.search(r"Left the flow's domain at t = [\d.]+, outside of which the flow is not valid\.", row.reason)
     assert limit.stable is None
     assert limit.reached == "none: the solution leaves the flow's domain"
 

@@ -215,7 +215,7 @@ def hides_failure(self, problem):
             r"^dtype_device_and_gradient_of_tensors of .*Can't call.*or declare `arrays_only`",
         ),
         ({"step": loses_gradients}, r"^dtype_device_and_gradient_of_tensors of .*loses the gradient of the tensors"),
-        ({"evaluations": says_nothing}, r"^statistics of .*stats count no force: let them be counted, or mend"),
+        ({"evaluations": says_nothing}, r"^statistics of .*stats count no force: count them, or correct"),
         ({"evaluations": says_two}, r"^statistics of .*`evaluations` tells 2 forces a step, but step\(\) evaluates 1"),
         ({"step": by_its_own_force}, r"^statistics of .*stats count no force"),
     ],

@@ -98,11 +98,11 @@ def test_trials_take_at_most_two_thirds_of_the_time(clock, monkeypatch):
     monkeypatch.setattr(trials, "trial", trial)
     first, second, *_ = trials.tried_starts(HH, HH.domain)
     session = Session(time_budget=60.0)
-    with pytest.warns(RuntimeWarning, match="trials of 60 s was over, .* after 3 of"):
+    with pytest.warns(RuntimeWarning, match="of 60 s the share for trials ended, .* after 3 of"):
         assert trials.chosen_trial(HH, HH.domain, session).start in (first, second)
     assert len(taken) == 4
     clock.now = 59.5
-    with pytest.warns(RuntimeWarning, match="trials of 1 s was over"):
+    with pytest.warns(RuntimeWarning, match="of 1 s the share for trials ended"):
         assert trials.chosen_trial(HH, HH.domain, Session(time_budget=1.0)).start in (first, second)
 
 

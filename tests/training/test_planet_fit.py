@@ -84,9 +84,15 @@ def test_bad_arguments(system, options, message):
     ("options", "message"),
     [
         ({"kind": "kepler", "stages": 3}, "^`stages` is not an option of flows of kind 'kepler'"),
-        ({"kind": "kepler", "solver": GaussNewton()}, "^`solver` is of fits in steps, and KeplerFit has none"),
-        ({"callback": print}, "^`callback` is of fits in steps, and KeplerFit has none"),
-        ({"fit": ClockedFit(1.0), "resume": "run.ckpt"}, "^`resume` is of fits in steps, and ClockedFit has none"),
+        (
+            {"kind": "kepler", "solver": GaussNewton()},
+            "^`solver` is for fits that run in steps, and KeplerFit does not",
+        ),
+        ({"callback": print}, "^`callback` is for fits that run in steps, and KeplerFit does not"),
+        (
+            {"fit": ClockedFit(1.0), "resume": "run.ckpt"},
+            "^`resume` is for fits that run in steps, and ClockedFit does not",
+        ),
     ],
 )
 def test_options_of_fits_in_steps_are_refused(options, message):
