@@ -63,7 +63,7 @@ def ensemble(
 ) -> Ensemble:
     """Solve for many initial states, and for many values of parameters.
 
-    The result of each orbit is the same to the last bit whatever the workers, the chunks and their order.
+    The result of each orbit does not depend on the workers, the chunks or their order, to the last bit.
 
     Parameters
     ----------
@@ -77,9 +77,9 @@ def ensemble(
         (n, 2d), drawn with a `numpy.random.Generator`. It is called for 4096 states at a time, each time with a
         generator of its own. The default is the system's state.
     n : int, optional
-        States to draw.
+        Number of states to draw.
     seed : int
-        For drawing.
+        Seed of the drawn states.
     params : mapping of str to array_like of shape (k,) or (), optional
         Values of parameters of the system. Arrays span a grid, with an axis for each in front of that of the orbits; a
         number replaces the system's value.
@@ -90,22 +90,22 @@ def ensemble(
         "final"; or a function of (t, y), the times (m,) and states (2d, m) of one orbit, that returns a number, an
         array, or a dict of such.
     workers : int, object with .map, or callable
-        A number of threads, or of processes where Python code has to run for each orbit or step, −1 for as many as
+        A number of threads, or of processes where Python code runs for each orbit or step, −1 for as many as
         there are cores; a `concurrent.futures.Executor`, a `dask.distributed.Client`, or anything else with `.map`;
         a function such as `map`; or a `joblib.Parallel`.
     chunk : int, optional
-        Orbits that a worker is given at a time; a store that is there already keeps its own.
+        Number of orbits in one task of a worker; an existing store keeps its own.
     store : path, optional
-        A folder, in zarr's format, into which the workers write each chunk of results when it is done, so that nothing
-        stays in memory. `xarray.open_zarr` reads it; workers on other machines must see it by the same path.
+        A folder, in zarr's format, into which the workers write each chunk of results when it is done, so that no
+        results stay in memory. `xarray.open_zarr` reads it; workers on other machines must see it by the same path.
     resume : bool
-        Go on with the store of the same ensemble, if there is one: what is there is not computed again. Ensembles are
-        compared by everything that defines them, functions and classes by their code and the values that they use.
+        Continue with the store of the same ensemble, if there is one: finished chunks are not computed again. Ensembles
+        are compared by everything that defines them, functions and classes by their code and the values that they use.
     same : bool
         With `resume`, assume that functions and Python objects are those of the store. Use it where they cannot be
         compared, such as results of a compiled library, or where code was rewritten with the same meaning.
     progress : bool or callable
-        True prints how far the ensemble is; a callable is called with the numbers of orbits done and in all.
+        True prints the progress; a callable is called with the number of finished orbits and of all.
     backend : "auto", "compiled" or "array"
         As for `solve`.
     **options

@@ -129,11 +129,11 @@ def load(
     Raises
     ------
     ValueError
-        If the file is missing, truncated, of another or a later format, or anything in it is not as it should be:
+        If the file is missing, truncated, of another or a later format, or has invalid content:
         tensors of the wrong name, shape or dtype, weights that are not finite, weights or a record (Δt, architecture,
         domain, figures) that are not those that were saved, an absurd architecture. Of a file of format 1, as earlier
         versions wrote them and as flows ship, the weights alone are compared with what was saved. Or if `system` is not
-        the one that the flow was made for, or `device` is not to be had.
+        the one that the flow was made for, or `device` is not available.
     TypeError
         If `path` is not a path, or `device` not a device.
     """

@@ -76,7 +76,7 @@ class MLPFlow(FlowMap):
 
     @classmethod
     def matching(cls, flow: FlowMap, seed: int = 0, scale: Scaling | None = None, activation: str = "tanh") -> MLPFlow:
-        """An MLPFlow whose parameters number those of `flow`, within 2 %."""
+        """An MLPFlow with as many parameters as `flow`, within 2 %."""
         widths = matching_widths(flow.ndof, flow.n_parameters)
         if widths is None:
             raise ValueError(
@@ -94,7 +94,7 @@ class MLPFlow(FlowMap):
         return cls(ndof, hidden, str(plan.get("activation")), dt, dtype)
 
     def forward(self, t: float | Tensor, x: Tensor, t0: Any = None) -> Tensor:
-        """ψ_t(x) for t ≥ 0, extended beyond Δt as SympFlow is; for t < 0 a ValueError, for want of an inverse."""
+        """ψ_t(x) for t ≥ 0, extended beyond Δt as SympFlow is; for t < 0 a ValueError, because there is no inverse."""
         checked = self._checked_time(t, x)
         negative = checked < 0 if isinstance(checked, float) else bool((to_values(checked) < 0).any())
         if negative:

@@ -128,9 +128,9 @@ class SympFlow(FlowMap):
     scale : Scaling, optional
         Units of q, p and t; `train` takes them from the domain. The default is 1 for q and p, and Δt for t.
     drive : Drive, optional
-        Of a driven system: the potentials V(t0, t, x) take the time t0 of the state too, see `SympFlow.timed`.
+        For a driven system: the potentials V(t0, t, x) take the time t0 of the state too, see `SympFlow.timed`.
     layers : iterable of Layer, optional
-        In place of all between `ndof` and `dt`.
+        A list of layers, in place of all arguments between `ndof` and `dt`.
 
     References
     ----------
@@ -216,9 +216,9 @@ class SympFlow(FlowMap):
         potentials : iterable of mapping, or of (str, torch.nn.Sequential)
             A mapping has the entry "kind", "kick" (V of q) or "drift" (V of p), and the arguments of
             `MLPPotential.from_weights`: "weights", those of `torch.nn.Linear`, (h_1, d + 1), …, (1, h_n); "biases",
-            (h_1,), …, (h_n,), that of the output being optional, as it moves nothing; "activation", a name, "tanh" if
-            there is none; and "time", the place of t in the input, "last" if there is none. A pair has the kind and a
-            module of Linear layers and activations in turn, whose last input is t.
+            (h_1,), …, (h_n,), that of the output being optional, because it has no effect; "activation", a name, "tanh"
+            if there is none; and "time", the place of t in the input, "last" if there is none. A pair has the kind and
+            a module of Linear layers and activations in turn, whose last input is t.
         dt : float
             Δt, the longest time that they were trained for.
         dtype : torch.dtype, optional
@@ -301,7 +301,8 @@ class SympFlow(FlowMap):
         system : HamiltonianSystem
             Separable.
         stages : int, optional
-            Number of kicks, 6 by default: the flow starts as so many equal leapfrog steps, or Verlet's: see `first`.
+            Number of kicks, 6 by default: the untrained flow is this number of equal leapfrog or Verlet steps, see
+            `first`.
         dt : float
             Δt.
         palindromic : bool
@@ -311,25 +312,26 @@ class SympFlow(FlowMap):
         degree : int, optional
             Of the polynomials that multiply V and T; 7 by default, 5 with a processor, which has more of them.
         force_gradient : bool or sequence of int, optional
-            True for a term in ½|∇V|²_{M⁻¹} in the kicks, which is the default where T is quadratic. Of a sequence of
-            integers these kicks of the kernel alone have it, counted from 0: ``[1, 3]`` of five. Where a force gradient
-            takes as long as a force, as on lattices of polynomials, more kicks with fewer of them go farther, and so do
-            two or three with one of them in few degrees of freedom.
+            True for a term in ½|∇V|²_{M⁻¹} in the kicks, which is the default where T is quadratic; or the numbers of
+            the kicks of the kernel that have it, counted from 0: ``[1, 3]`` of five. Where a force gradient takes as
+            long as a force, as on lattices of polynomials, more kicks with fewer force gradients are more efficient; in
+            few degrees of freedom two or three kicks with one of them.
         processor : int
             Number of kicks of χ in ψ̄_t = χ_t ∘ K_t ∘ χ_t⁻¹, 0 for none. A run executes χ⁻¹ once, the kernel K of
             `stages` kicks in every step, and χ for every output.
         curvature : bool or sequence of int
             True for a further term in ½ v·∇²V v, v = M⁻¹∇V, which takes third derivatives of V: for symbolic systems.
-            Or the numbers of the kicks that have it, of those with force gradients. A trained kick with it comes tens
-            of times nearer, and takes 1.1 to 1.5 times as long.
+            Or the numbers of the kicks that have it, of those with force gradients. A trained kick with it is tens of
+            times more accurate, and takes 1.1 to 1.5 times as long.
         polynomial : int, optional
             In place of force gradients and curvatures every kick has a trained polynomial in q of this total degree,
             t³ Σ_m e_m(t) q^m: for symbolic systems in few degrees of freedom. Its monomials are those of V and of what
-            products of gradients make from it, ∇VᵀM⁻¹∇V first, where V is a polynomial, else those as even as V. For a
-            polynomial V of degree n, 2n − 2 is a good one.
+            products of gradients make from it, ∇VᵀM⁻¹∇V first, where V is a polynomial, else those with the symmetry of
+            V. For a polynomial V of degree n, 2n − 2 is a good choice.
         first : {"drift", "kick"}
-            What equal steps begin and end with. A kick that ends a step and begins the next is one: with an even number
-            of kicks, where each has a polynomial or a curvature, "kick" gives a palindrome more numbers at no cost.
+            The map that begins and ends a step. The last kick of a step and the first of the next are merged: with an
+            even number of kicks, each with a polynomial or a curvature, "kick" gives a palindrome more numbers at no
+            cost.
         dtype, device
             Of the parameters.
 
@@ -357,14 +359,14 @@ class SympFlow(FlowMap):
     ) -> Any:
         """Return a `SplitFlow`, for stiff systems: of exact flows of the parts of H, the linear one among them.
 
-        Untrained it is so many equal Strang steps; `train(system, flow=flow)` fits it to the system and its domain.
+        Untrained it is `stages` equal Strang steps; `train(system, flow=flow)` fits it to the system and its domain.
 
         Parameters
         ----------
         system : HamiltonianSystem
             One with parts that are solved exactly: `sympflow.hamiltonian.parts.exact_parts`.
         stages : int
-            Number of Strang steps, palindromic throughout.
+            Number of Strang steps; the flow is a palindrome.
         dt : float
             Δt.
         terms : int
@@ -372,8 +374,8 @@ class SympFlow(FlowMap):
         filters : bool
             True if the parts see the fast modes through trained filters.
         force_gradient : bool or sequence of int, optional
-            True for a term in ½|∇U|²_{M⁻¹} in the kicks, or the numbers of those that have it, counted from 0, the
-            same from either end; by default all have it where H = ½ pᵀM⁻¹p + ½ qᵀKq + U(q).
+            True for a term in ½|∇U|²_{M⁻¹} in the kicks, or the numbers of those that have it, counted from 0,
+            symmetric about the middle; by default all have it where H = ½ pᵀM⁻¹p + ½ qᵀKq + U(q).
         parts : sequence of str, optional
             The parts, as for the method "strang_parts".
         linear_outside : bool
@@ -414,10 +416,10 @@ class SympFlow(FlowMap):
         stages : int
             s, of the method of order 2s.
         steps : int, optional
-            Equal steps in Δt; by default so many that at 99 % of some states the error of ψ̄_Δt is below 1e-10 of
-            their spread.
+            Number of equal steps in Δt; by default the least for which the error of ψ̄_Δt is below 1e-10 of the spread
+            of the states at 99 % of some states.
         states : array_like of shape (n, 2d), optional
-            These states; by default some of the domain of the system.
+            The states at which that is measured; by default some of the domain of the system.
         dtype, device
             Of the states.
 
@@ -485,7 +487,7 @@ class SympFlow(FlowMap):
         return None if self.drive is None else self.drive.period
 
     def transferred(self, system: HamiltonianSystem) -> Self:
-        """Return an untrained flow of another driven system, with the numbers of this one, to start from in `train`.
+        """Return an untrained flow of another driven system, with the numbers of this one, as a start for `train`.
 
         Raises
         ------
@@ -581,7 +583,7 @@ class SympFlow(FlowMap):
         return [(layer.kind == "kick", layer.potential) for layer in layers]
 
     def step_constants(self, x: Tensor, *t0: Tensor) -> Tensor:
-        """The constants of a step from states (N, 2d) that its networks take beside these and t: (m, N)."""
+        """Inputs of the networks of a step from states (N, 2d), besides the states and t: (m, N)."""
         return self._opened(self._columns(0.0, self.lift(x, *t0))[1], 0.0)[0][self.ndof :]
 
     def hamiltonian_unchecked(self, t: float | Tensor, x: Tensor, t0: Any = None) -> Tensor:

@@ -103,7 +103,7 @@ class Box:
 
     @cached_property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """`low` and `high` as arrays, to be read only."""
+        """`low` and `high` as read-only arrays."""
         low, high = np.asarray(self.low), np.asarray(self.high)
         low.setflags(write=False)
         high.setflags(write=False)
@@ -123,18 +123,18 @@ class Box:
 class EnergySublevel:
     """The states of a box whose energy is below a bound: {x ∈ box : H(x) < energy}.
 
-    The box picks the component: inside its box, the Hénon–Heiles set H < 1/6 is the bounded well only. Two more bounds
-    make it a shell that the exact flow does not leave: a lower bound of the energy, and, for motion in a plane under a
-    central force, bounds of the angular momentum.
+    The box selects the component: inside its box, the Hénon–Heiles set H < 1/6 is the bounded well only. Two more
+    bounds make it a shell that the exact flow does not leave: a lower bound of the energy, and, for motion in a plane
+    under a central force, bounds of the angular momentum.
 
     Parameters
     ----------
     energy : float
         The bound, in the units of H.
     box : Box
-        Must contain the component that is meant.
+        A box that contains the wanted component.
     hamiltonian : callable, optional
-        H(x), x of shape (..., 2d). A `HamiltonianSystem` fills it in with its own.
+        H(x), x of shape (..., 2d). A `HamiltonianSystem` sets it to its own.
     above : float, optional
         Lower bound of the energy.
     angular_momentum : (float, float), optional
@@ -240,7 +240,7 @@ class EnergySublevel:
             return ((x >= low) & (x <= high)).all(-1) & self._within(x, slack)
 
     def bounds(self, slack: float) -> tuple[np.ndarray, np.ndarray]:
-        """The box, grown by the relative size of the slack: a state on its face does not leave by rounding."""
+        """The box, enlarged by the tolerance, so that a state on its face does not leave it by rounding."""
         low, high = self.box.bounds
         if slack == 0.0:
             return low, high
@@ -308,7 +308,7 @@ class Tube:
     groups : sequence of sequences of int, optional
         Coordinates that are near the orbit together; the default is all of them. Several groups give the product of
         tubes, each about the orbit's projection: for planets, say, each near its own ellipse, at any relative phase.
-        They must hold every one of 0 … 2d−1 once.
+        Each of 0 … 2d−1 must occur in them once.
 
     Notes
     -----

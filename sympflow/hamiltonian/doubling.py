@@ -74,20 +74,20 @@ def doubled(
 
     Its states are [q₊, q₋, p₋, p₊], of 4d numbers: the mean and the difference of two copies of the system, p₋ being
     the momentum of q₊, and p₊ that of q₋. A physical state [q, p] is [q, 0, 0, p]; `solve` lifts a `y0` of 2d numbers
-    itself, and `Solution.physical()` is the way back. See `sympflow.hamiltonian.doubling` for H.
+    itself, and `Solution.physical()` converts back. See `sympflow.hamiltonian.doubling` for H.
 
-    H is linear in q₋ and p₋. So where these are 0 they stay 0 exactly, with every Runge–Kutta, implicit and splitting
-    method, and whatever they are, (q₊, p₊) moves by the physical equations. It is separable, so that splitting methods
+    H is linear in q₋ and p₋. So if they are 0 they stay 0 exactly, with every Runge–Kutta, implicit and splitting
+    method; and for any values of them (q₊, p₊) obeys the physical equations. It is separable, so that splitting methods
     apply, if the system is and F depends on q alone.
 
     Parameters
     ----------
     system : HamiltonianSystem
-        H of d degrees of freedom; its damping, −Γp, is taken over.
+        A system of d degrees of freedom; its damping, −Γp, is included.
     force : str, sympy.Expr, a list of d of these, or callable
         F in q1 … qd, p1 … pd (or q and p), one expression for each momentum: "-c*p*abs(p)", or
         ["-c*p1/(q1**2 + q2**2)", "-c*p2/(q1**2 + q2**2)"]; or F(q, p) written with torch functions, (..., d), each, to
-        (..., d), by which the system is not compiled. The default is 0, where the system has damping.
+        (..., d), with which the system is not compiled. The default is 0, for a system with damping.
     params : mapping of str to float, optional
         Values of the other symbols of F; those of `system.params` are known.
     domain : Domain, optional
@@ -109,7 +109,7 @@ def doubled(
     Warns
     -----
     UserWarning
-        If the force is one of a potential, which belongs into H.
+        If the force derives from a potential: add that to H instead.
 
     References
     ----------

@@ -33,19 +33,19 @@ class LatticeStates:
     """The states that a lattice takes at an energy density, whatever its size.
 
     A state is drawn as in thermal equilibrium: its energy from a gamma distribution, as that of as many oscillators at
-    one temperature, positions and momenta at random, then relaxed by the lattice's own dynamics. So a few sites are as
-    often as far from rest as any few neighbours in a large lattice are.
+    one temperature, positions and momenta at random, then relaxed by the lattice's own dynamics. So the few sites have
+    the same distribution of states as a few neighbours in a large lattice.
 
-    A state belongs to the set if the densest block of as many neighbours as `HamiltonianSystem.subsystem` has sites has
-    at most 8 times the upper density, and at least an eighth of the lower one: so a wave alone in a lattice at rest
-    is judged by itself.
+    Take blocks of as many neighbours as `HamiltonianSystem.subsystem` has sites. A state belongs to the set if the
+    densest block has at most 8 times the upper density and at least an eighth of the lower one. So a single wave in a
+    lattice at rest is judged by its own energy.
 
     Parameters
     ----------
     density : float or (float, float)
-        H per site above that of the lattice at rest; two bounds, for densities that are drawn between them.
+        H per site above that of the lattice at rest; or two bounds, between which densities are drawn.
     system : Hamiltonian, optional
-        The lattice. A `HamiltonianSystem` puts itself in.
+        The lattice. A `HamiltonianSystem` sets it to itself.
 
     Examples
     --------
@@ -81,7 +81,7 @@ class LatticeStates:
 
     @classmethod
     def of_states(cls, system: Hamiltonian, states: np.ndarray) -> Self:
-        """The set that states (..., 2d) of a system are of; a ValueError if they have no energy above that of rest."""
+        """The set to which states (..., 2d) belong; a ValueError if their energy is not above that at rest."""
         states = states.reshape(-1, 2 * system.ndof)
         means, blocks = cls.rest_of(system, states[0]).densities(states)
         low = float(np.quantile(means, SHARE, method="lower"))
@@ -94,7 +94,7 @@ class LatticeStates:
         return cls((low, high), system)
 
     def of(self, system: Hamiltonian) -> Self:
-        """The same set, of a system: itself where it is of one of that shape; a ValueError if it is not a lattice."""
+        """The same set for a system, unchanged for one of the same shape; a ValueError if it is not a lattice."""
         if self.system is not None and system.symbols is not None and system.ndof == self.system.ndof:
             return self
         other = self.checked(system)
@@ -122,7 +122,7 @@ class LatticeStates:
 
     @property
     def width(self) -> int | None:
-        """The length of its states; None without a system, for any."""
+        """The length of its states; None without a system, for any length."""
         return None if self.system is None else 2 * self.system.ndof
 
     @property

@@ -180,38 +180,39 @@ class HamiltonianSystem(Hamiltonian, Answering):
     ----------
     potential : callable, optional
         V(q), q of shape (..., d), returning (...), written with NumPy or torch. Then H = ½ pᵀM⁻¹p + V(q) is separable.
-        It is traced once, differentiated exactly and compiled; `program` is what was traced. A function that cannot be
-        traced, such as one that branches on a value, runs as it is, and `repr` says why: then it must be written with
-        torch, or have a `gradient`. With Numba functions (`potential`, `gradient` and `hessian_vector`) the system runs
-        compiled. A function that writes into q is a ValueError; so is a gradient that is not that of V: see
-        `check_functions`.
+        It is traced once, differentiated exactly and compiled; `program` is the result. A function that cannot be
+        traced, such as one that branches on a value, runs as it is, and `repr` shows the reason: then it must be
+        written with torch, or have a `gradient`. With Numba functions (`potential`, `gradient` and `hessian_vector`)
+        the system runs compiled. A function that writes into q is a ValueError; so is a gradient that is not that of V:
+        see `check_functions`.
     hamiltonian : callable, optional
         H(q, p). Give this or `potential`. Where H is traced and found to be T(p) + V(q), the system is separable.
     ndof : int
         Degrees of freedom d.
     mass : float or array_like of shape (d,) or (d, d), optional
-        M, symmetric positive definite; the default is 1. Only with `potential`. To a tensor that requires gradients
-        these flow, by tensor operations: runs are not compiled then.
+        M, symmetric positive definite; the default is 1. Only with `potential`. Gradients flow to a tensor that
+        requires them.
     gradient : callable, optional
         ∇V(q), (..., d) to (..., d); as a Numba function: gradient(q, out).
     hessian_vector : callable, optional
         ∇²V(q)·v, (..., d), (..., d) to (..., d); as a Numba function: hessian_vector(q, v, out).
     stiffness_matrix : array_like of shape (d, d), optional
-        A symmetric K, part ½ qᵀKq of the potential, that methods with an exact linear flow take as their `linear_part`.
-        Only with `potential`; of a symbolic system it is read off.
+        A symmetric K: methods with an exact linear flow take ½ qᵀKq, a part of the potential, as their `linear_part`.
+        Only with `potential`; for a symbolic system it follows from H.
     time : bool
         True for a driven system: the first argument of every function is the time t, a number: V(t, q),
         gradient(t, q), hessian_vector(t, q, v), H(t, q, p); as Numba functions gradient(t, q, out) and
         hessian_vector(t, q, v, out). Functions of the system then take the time after the states.
     period : float, optional
-        The period in t of H, of a driven system; other values than its own are a ValueError. Sections and multipliers
-        take it.
+        The period of H in t, for a driven system; a wrong value is a ValueError. It is the default of sections and
+        multipliers.
     damping : float or array_like of shape (d,) or (d, d), optional
         Γ: one rate, one for each p, or a symmetric positive semi-definite matrix; 0 for none. Splitting
-        methods on the splitting "kinetic" and the Runge–Kutta methods solve it; all else refuses it, with the reason.
+        methods on the splitting "kinetic", Gauss and Runge–Kutta methods solve it; all others refuse it, with the
+        reason.
     name : str
     domain : Domain, optional
-        Ω, where flows are trained. Classical methods never need one.
+        Ω, the states on which flows are trained. Classical methods do not need it.
     y0 : array_like of shape (2d,), optional
         Default initial state.
     t_span : (float, float)
@@ -219,14 +220,14 @@ class HamiltonianSystem(Hamiltonian, Answering):
     dt : float, optional
         Default step of the fixed-step classical methods. Without it, `system.dt` is 0.05/ω, to two digits, with the
         largest frequency or rate ω of the linearised motion at `y0`, or over the domain; 0.05 where there is none. For
-        a system without both of these, `solve` takes ω at the states that it is given.
+        a system without both of these, `solve` takes ω at its `y0`.
     energy_scale : float, optional
-        What energy errors are relative to; the default is |H(y0)|.
+        The scale of relative energy errors; the default is |H(y0)|.
     exact : callable, optional
-        The solution that starts from `y0` at the beginning of `t_span`, where it is known: exact(t), times (...) to
-        states (..., 2d). It is for comparison only; no method uses it.
+        The exact solution from `y0` at the beginning of `t_span`, if it is known: exact(t), times (...) to states (...,
+        2d). It is for comparison only; no method uses it.
     check : bool
-        False leaves out the test of the functions, see `check_functions`, that the first use of the system makes.
+        False omits the test of the functions at the first use of the system, see `check_functions`.
 
     Attributes
     ----------
@@ -344,24 +345,24 @@ class HamiltonianSystem(Hamiltonian, Answering):
             The names that coordinates and momenta have in the expression, such as ``q=["x", "y"], p=["px", "py"]`` or
             `dynamicsymbols`; in the system they are q1 … qd and p1 … pd.
         params : mapping of str to float, optional
-            Values of the other symbols: finite real numbers. A name that is given here is a symbol whatever it means
-            otherwise. `system.params` holds them, to be read only. A spline of SciPy, such as `CubicSpline(t, a)` or
-            `make_interp_spline(t, a)`, is a function of t by its samples; runs beyond them are refused, unless it is
-            periodic.
+            Values of the other symbols: finite real numbers. A name that is given here is a symbol, also if it is that
+            of a constant or a function. `system.params` holds them, read-only. A spline of SciPy, such as
+            `CubicSpline(t, a)` or `make_interp_spline(t, a)`, is a function of t; runs beyond its samples are refused,
+            unless it is periodic.
         time : str or sympy.Symbol, optional
-            The symbol that is the time, "t", of a driven system H(t, q, p).
+            The symbol of the time, such as "t", of a driven system H(t, q, p).
         period : float, optional
-            The period of H in t; other values than its own are a ValueError.
+            The period of H in t; a wrong value is a ValueError.
         damping, name, domain, y0, t_span, dt, energy_scale, exact
             As for the class.
 
         Raises
         ------
         ValueError, TypeError
-            If the expression cannot be parsed, has symbols without a value, or a time that `time` does not name; if
-            H does not depend on that, or has another period; if H jumps in q or p, or holds delta functions other than
-            impulses DiracDelta(t − a)·W(q), which are kicks p −= ∇W(q) at the time a; if `damping` is not symmetric,
-            has negative rates, or another shape.
+            If the expression cannot be parsed, has symbols without a value, or depends on a time that `time` does not
+            name; if H does not depend on `time`, or has another period; if H jumps in q or p, or holds delta functions
+            other than impulses DiracDelta(t − a)·W(q), which are kicks p −= ∇W(q) at the time a; if `damping` is not
+            symmetric, has negative rates, or another shape.
         """
         if isinstance(expression, str) and all(given is None for given in (q, p, params, time)):
             from sympflow.hamiltonian.written import written
@@ -438,7 +439,7 @@ class HamiltonianSystem(Hamiltonian, Answering):
         fields : str or sequence of str
             Names of the fields at a site.
         params : mapping of str to float or array of the lattice's shape, optional
-            Values of the other symbols; an array has one for each site, and for each bond that of its lower end, or of
+            Values of the other symbols; an array has one for each site; a bond takes the value of its lower end, or of
             the first site where the lower end is a wall.
         damping, name, domain, y0, t_span, dt, energy_scale, exact
             As for the class.
@@ -485,22 +486,22 @@ class HamiltonianSystem(Hamiltonian, Answering):
         Parameters
         ----------
         potential : str or sympy.Expr
-            V of one pair in its distance `r`, in m1 and m2, the masses of both, and in other names of `params` and
-            `bodies`, such as "-G*m1*m2/r". It must be the same with both bodies exchanged.
+            V of one pair in its distance `r`, in the masses m1 and m2 of both, and in names of `params` and `bodies`,
+            such as "-G*m1*m2/r". It must be the same with both bodies exchanged.
         masses : array_like of shape (n,)
         dim : int
             Coordinates of a body, 1 to 3. A state is y = [q, p]; ``q.reshape(n, dim)`` are the places of the bodies.
         box : float or sequence of `dim` floats, optional
             Lengths of a periodic box: r is the distance to the nearest image.
         cutoff : float, optional
-            Distance beyond which bodies do not interact, at most half of the box. So that H is smooth, V is replaced by
+            Distance beyond which bodies do not interact, at most half of the box. To keep H smooth, V is replaced by
             V(r) − V(c) − (r² − c²) V′(c)/(2c).
         softening : float, optional
             ε: r is √(|q_i − q_j|² + ε²), which is never 0.
         params : mapping of str to float, optional
             Values of names in V that are the same for all pairs.
         bodies : mapping of str to array_like of shape (n,), optional
-            Values that differ from body to body: of "c" the values are c1 and c2 in V.
+            Values that differ from body to body: in V the values of "c" of the two bodies are c1 and c2.
         damping, name, domain, y0, t_span, dt, energy_scale, exact
             As for the class.
 
@@ -539,34 +540,35 @@ class HamiltonianSystem(Hamiltonian, Answering):
         """Planets about a star: H = Σ_i |p_i|²/(2 m_i) − G Σ_{i<j} m_i m_j/r_ij, for methods of the splitting "kepler".
 
         States are inertial, y = [q, p]; ``q.reshape(n, 3)`` are the places of the bodies, the star first. The methods
-        "wisdom_holman" and "kepler_aba864" have coordinates of their own inside of a run only. All other methods take
-        the system as one of `pairs`.
+        "wisdom_holman" and "kepler_aba864" use other coordinates, but only inside a run. All other methods treat the
+        system as one of `pairs`.
 
         Parameters
         ----------
         masses : array_like of shape (n,)
-            The star's first, which is the heaviest. Bodies of mass 0 feel the others and are not felt; their momenta
-            are per unit mass, and no part of H.
+            The star, which is the heaviest, first. Bodies of mass 0 feel the others and exert no force; their momenta
+            are per unit mass and do not enter H.
         elements : mapping of str to array_like of shape (n − 1,), or array_like of shape (n − 1, 6)
             Heliocentric orbital elements of the planets: "a", "e", "inc", "node" (ascending), "peri" (the argument of
-            the pericentre) and "M" (the mean anomaly), in radians; all but a are 0 by default. Of hyperbolas
-            e > 1 and a < 0. The centre of mass is at rest at the origin. Give them or `y0`.
+            the pericentre) and "M" (the mean anomaly), in radians; all but a are 0 by default. Hyperbolas have e > 1
+            and a < 0. The centre of mass is at rest at the origin. Give them or `y0`.
         G : float, optional
             The gravitational constant, by default 1.
         units : str or sequence of 3 str, optional
             In place of G: "SI", or names of a length ("AU", "km", "m"), a time ("day", "year", "s") and a mass
             ("solar mass", "Jupiter mass", "Earth mass", "kg"), such as "AU, day, solar mass".
         coordinates : {"jacobi", "democratic"}
-            Inside of a run: each planet as seen from the centre of mass of all inside of its orbit, or, democratic
-            heliocentric, from the star, where kicks hold the motion of the star and are less accurate.
+            Coordinates inside a run: each planet relative to the centre of mass of all bodies inside its orbit
+            (Jacobi), or relative to the star (democratic heliocentric), where the kicks include the motion of the star
+            and are less accurate.
         encounter : float or None
-            Two planets that come closer to each other than so many Hill radii end a run of the splitting "kepler", with
-            status −1, their numbers and the time. None for no such end.
+            A run of the splitting "kepler" ends with status −1, the numbers of the planets and the time when two
+            planets come closer to each other than this number of Hill radii. None to go on.
         extra : str or sympy.Expr, optional
-            Φ, a further potential per unit mass of each body, Σ_i m_i Φ(q_i − q_0) in H, for kicks: an expression of
-            x, y, z and r, the place of a body as seen from the star, m, the star's mass, G, and the names of `params`.
+            Φ, a further potential per unit mass of each body, Σ_i m_i Φ(q_i − q_0) in H, an expression in x, y, z and
+            r, the position of a body relative to the star, m, the star's mass, G, and the names of `params`.
             ``"-3*(G*m/(c*r))**2"`` gives the precession of general relativity, and with z along the axis of the star
-            ``"J2*G*m*R**2*(3*z**2/r**2 - 1)/(2*r**3)"`` is its flattening. The star is pulled in turn.
+            ``"J2*G*m*R**2*(3*z**2/r**2 - 1)/(2*r**3)"`` is its flattening. The reaction acts on the star.
         params : mapping of str to float, optional
             Values of other names in `extra`.
         name, domain, y0, t_span, dt, energy_scale, exact
@@ -613,8 +615,8 @@ class HamiltonianSystem(Hamiltonian, Answering):
         Returns
         -------
         HamiltonianSystem
-            With `sympflow.LatticeStates` of the same energy density as its domain, where
-            the system has a domain or a `y0` from which that is found. Arrays in `params` are cut to the first sites.
+            Its domain is `sympflow.LatticeStates` of the same energy density, if the system has a domain or a `y0`.
+            Arrays in `params` are cut to the first sites.
 
         Raises
         ------
@@ -647,7 +649,7 @@ class HamiltonianSystem(Hamiltonian, Answering):
         return Scene(self.name, domain, None, self.t_span, self.dt)
 
     def local_states(self) -> LatticeStates | None:
-        """The states, for any size, at the energy density of the domain, or else of `y0`; None without both."""
+        """The states at the energy density of the domain, or else of `y0`, for any size; None without both."""
         domain = self.domain
         if domain is None and self.y0 is None:
             return None
@@ -698,7 +700,7 @@ class HamiltonianSystem(Hamiltonian, Answering):
         shape : int or sequence of up to three ints
             Sites along each axis.
         length : float or sequence of floats, optional
-            Of each axis; by default one for each site.
+            Length of each axis; by default 1 per site.
         dispersion : str or sympy.Expr
             ω of a wave number `k`, an even function, added up over the axes: "k**2/2", or "1 - cos(k)" for a chain
             whose neighbours are coupled.
@@ -770,7 +772,7 @@ class HamiltonianSystem(Hamiltonian, Answering):
 
     @property
     def period(self) -> float | None:  # type: ignore[override]
-        """The period of H in t, where one was named, or was that of the system of other parameters and still is."""
+        """The period of H in t, if one was given; kept for other values of the parameters where it still holds."""
         if self._period is None and self._former_period is not None:
             try:
                 self._set_period(self._former_period)
@@ -790,14 +792,14 @@ class HamiltonianSystem(Hamiltonian, Answering):
 
     @property
     def scene(self) -> Scene:
-        """The scene for other parameters: an `exact` solution belongs to those of the system, and is left out."""
+        """The scene for other values of the parameters: without the `exact` solution, which holds for the old ones."""
         dt = None if self.step_is_open else self.dt
         return replace(self._scene, name=self._name, dt=dt, exact=None)
 
     def with_scene(self, **scene: Unpack[SceneOptions]) -> HamiltonianSystem:
         """The same system with other defaults: of `name`, `domain`, `y0`, `t_span`, `dt`, `energy_scale` and `exact`.
 
-        A step that was not given is chosen anew, and `exact` goes with its `y0` and its `t_span`.
+        A step that was not given is chosen again, and `exact` is dropped with another `y0` or `t_span`.
 
         Examples
         --------
@@ -828,7 +830,7 @@ class HamiltonianSystem(Hamiltonian, Answering):
 
     @property
     def dt(self) -> float:
-        """The default step of the fixed-step classical methods: the one given, or by the fastest motion."""
+        """The default step of the fixed-step classical methods: as given, or chosen by the fastest motion."""
         given = self._scene.dt
         return self._chosen_step if given is None else given
 
@@ -847,12 +849,12 @@ class HamiltonianSystem(Hamiltonian, Answering):
     def params(self) -> Mapping[str, float]:
         """The values of the parameters, read-only, because code is generated from them.
 
-        A system with others is made by `HamiltonianSystem.from_sympy`, or by the function of its scene.
+        For other values use `with_params`.
         """
         return self._params
 
     def check_parameters(self, names: Iterable[str]) -> None:
-        """Refuse names other than those of the parameters of H, by a ValueError with these.
+        """Raise a ValueError for names that are not parameters of H; it lists the known ones.
 
         A TypeError if the system is given by functions, or a parameter is an array of a lattice's sites.
         """
@@ -915,7 +917,7 @@ class HamiltonianSystem(Hamiltonian, Answering):
         return made
 
     def check_functions(self, y0: Array | None = None) -> None:
-        """Test once that the functions of a user agree with each other: `solve`, `train` and their like call it.
+        """Test once that the functions of a user agree with each other; `solve`, `train` and others call it.
 
         At a few states, y0 (the system's if it is None), near these and of the domain, the gradient, given or
         automatic, is compared with differences of H, and `hessian_vector` with those of the gradient; a batch with
@@ -948,9 +950,9 @@ class HamiltonianSystem(Hamiltonian, Answering):
         self._tested = self._tested | {kind: reach(probes[:, : self._arguments], self._arguments // self.ndof)}
 
     def check_functions_along(self, y: Array) -> bool:
-        """Test the functions of a user where a run went far beyond the states at which they were tested: `solve` does.
+        """Test the functions of a user where a run went far beyond the tested states; `solve` calls it.
 
-        At the farthest of the states y a RuntimeWarning says what `check_functions` would refuse, and True is returned.
+        If `check_functions` fails at the farthest of the states y, a RuntimeWarning says why, and True is returned.
 
         Parameters
         ----------
@@ -975,14 +977,14 @@ class HamiltonianSystem(Hamiltonian, Answering):
         return False
 
     def probe_times(self, length: float | None = None) -> list[float]:
-        """The times at which functions of the system are tried: the first one, of a driven system others after it."""
+        """The times at which functions of the system are tested: the first one, and for a driven system later ones."""
         t0, t1 = self.t_span
         return [t0] if self.autonomous else probe_times(t0, t1 if length is None else t0 + length).tolist()
 
     def kicks(self, t0: float, t1: float) -> list[Kick]:
-        """Return the impulses of H between two times, in their order; each has its time `t`, and maps states.
+        """Return the impulses of H between two times, in order; each has a time `t` and is a map of states.
 
-        A term DiracDelta(t − a)·W(q, t) of H is one at the time a: p −= ∇W(q, a).
+        A term DiracDelta(t − a)·W(q, t) of H is an impulse at the time a: p −= ∇W(q, a).
 
         Examples
         --------
@@ -996,7 +998,7 @@ class HamiltonianSystem(Hamiltonian, Answering):
     def linear_part(self) -> LinearPart:
         """The quadratic part of H: K, its frequencies, the remaining potential U, and the `stiffness`.
 
-        A ValueError if there is no such part, or its stiff direction turns.
+        A ValueError if there is no such part, or its stiff directions rotate.
         """
         from sympflow.hamiltonian.linear_part import linear_part
 
@@ -1022,7 +1024,7 @@ class HamiltonianSystem(Hamiltonian, Answering):
 
     @property
     def title(self) -> str:
-        """The name and the parameters as they are printed; H where the name says nothing."""
+        """The name and the parameters as printed; H where there is no name."""
         params = parameters_text(self.params, GREEK, " = ")
         name = PROPER.get(self.name, self.name.replace("_", " ") if self._name else self.name)
         return name + (f", {params}" if params else "")

@@ -34,7 +34,7 @@ def time_transformed(
     system : HamiltonianSystem
         Separable.
     shift : float, optional
-        c, above V wherever the motion goes; every number above the energy is. The default is `default_shift(system)`.
+        c, larger than V along the motion, as every number above the energy is. The default is `default_shift(system)`.
     domain : Domain, optional
         Ω of the new system, for `train`: a set of states [q, t, p, B], such as ``Tube(sol.states, radius)`` around a
         solution of the new system.
