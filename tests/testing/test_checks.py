@@ -216,7 +216,7 @@ def hides_failure(self, problem):
         ),
         ({"step": loses_gradients}, r"^dtype_device_and_gradient_of_tensors of .*loses the gradient of the tensors"),
         ({"evaluations": says_nothing}, r"^statistics of .*stats count no force: count them, or correct"),
-        ({"evaluations": says_two}, r"^statistics of .*`evaluations` tells 2 forces a step, but step\(\) evaluates 1"),
+        ({"evaluations": says_two}, r"^statistics of .*`evaluations` states 2 forces a step, but step\(\) evaluates 1"),
         ({"step": by_its_own_force}, r"^statistics of .*stats count no force"),
     ],
 )
