@@ -24,11 +24,13 @@ ALLOWED = [
     "        assert sympflow.solve(scene(), method, (0, 1), dt=0.1).stats['backend'] == 'compiled'\n"
     "    sympflow.solve(scene(), 'verlet', (0, 1), backend='array').energy()\n"
     "    assert scene().hessian(scene().y0) is not None",
+    "for scene in sympflow.systems.pendulum, sympflow.systems.quartic, sympflow.systems.henon_heiles:\n"
+    "    assert sympflow.solve(scene(), 'sympflow', (0, 10)).stats['backend'] == 'compiled'",
     "import sympflow; sympflow.systems.henon_heiles().expression",
     "import sympflow\nsympflow.available(); sympflow.shipped_flows()",
     "import sympflow; sympflow.solve(sympflow.systems.pendulum(), 'rk45', (0, 1))",
 ]
-"""Code that needs NumPy alone; the piece with `expression` needs SymPy too, and the last one SciPy."""
+"""Code that needs NumPy alone; flows need the reader of their weights too, `expression` SymPy, the last one SciPy."""
 
 COMPILED = [
     "sympflow.lyapunov(sympflow.systems.henon_heiles(), 'verlet', (0, 1), dt=0.1, backend='compiled')",
@@ -65,7 +67,12 @@ def loaded_after(*codes: str) -> dict[str, str]:
 
 def test_a_call_loads_what_it_needs():
     loaded = loaded_after(*ALLOWED)
-    assert loaded == {"sympy": ALLOWED[3], "scipy": ALLOWED[-1], "numpy.f2py": ALLOWED[-1]}  # by SciPy
+    assert loaded == {
+        "safetensors": ALLOWED[3],
+        "sympy": ALLOWED[4],
+        "scipy": ALLOWED[-1],
+        "numpy.f2py": ALLOWED[-1],
+    }  # by SciPy
 
 
 def test_neither_compiled_runs_nor_flows_that_ship_load_numba_or_torch():

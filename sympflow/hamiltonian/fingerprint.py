@@ -10,7 +10,10 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from sympflow.arrays import to_numpy
+from sympflow.compiler.arrange import Arrangement
+from sympflow.compiler.program import Program
 from sympflow.hamiltonian.domain import Domain, domain_of
+from sympflow.hamiltonian.formulas import TracedHamiltonian
 from sympflow.lazy import lately_kept
 
 if TYPE_CHECKING:
@@ -175,9 +178,16 @@ def _agrees(system: Hamiltonian, identity: Identity) -> bool:
 
 @lately_kept
 def _is_proved(system: Hamiltonian, mine: str | None) -> bool:
+    if mine is None:
+        return False
+    form = system.form
+    if isinstance(form, TracedHamiltonian) and form.text is not None:
+        read = _read(mine, system.ndof)
+        plain = read is not None and isinstance(read.form, TracedHamiltonian)
+        return plain and _differ_by_number(read.form.H.program, form.H.program)
     theirs = system.expression
-    if mine is None or theirs is None or mine == theirs:
-        return mine is not None and mine == theirs
+    if theirs is None or mine == theirs:
+        return mine == theirs
     if len(mine) + len(theirs) > LONGEST_COMPARED:
         return False
     import sympy
@@ -186,6 +196,13 @@ def _is_proved(system: Hamiltonian, mine: str | None) -> bool:
     if read is None or read.symbols is None or given is None:
         return False
     return bool(sympy.expand(read.symbols.H - given.H).is_number)
+
+
+def _differ_by_number(a: Program, b: Program) -> bool:
+    """Return True if two programs of the same inputs are seen to be the same but for a number, multiplied out."""
+    made = Arrangement([(repr(x), 0) for x in a.inputs])
+    difference = made.number(a(*made.states)[0]) - made.number(b(*made.states)[0])
+    return difference.constant is not None
 
 
 def _floats(values: Any, ndim: int) -> np.ndarray:
@@ -214,10 +231,14 @@ def _energies(system: Hamiltonian, states: np.ndarray) -> np.ndarray:
 def _read(expression: str | None, ndof: int) -> Any:
     """The H of a text in a file, read by a grammar and never executed; None unless it has d degrees of freedom."""
     from sympflow.hamiltonian.hamiltonian import Hamiltonian
-    from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
+    from sympflow.hamiltonian.written import written
 
     if expression is None:
         return None
+    if (found := written(expression)) is not None:
+        return Hamiltonian("", *found, True) if found[0].ndof == ndof else None
+    from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
+
     symbols = None
     for time in (None, "t"):
         try:

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import operator
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import sympy as sp
+from mpmath import mp
 
+from sympflow.compiler.numbers import Number
+from sympflow.compiler.program import Program
 from sympflow.hamiltonian.domain import Domain
-from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, printable
 
-__all__ = ["UNTOUCHED", "OnInterval", "Ranges", "on_interval", "position_ranges"]
+if TYPE_CHECKING:
+    from sympflow.hamiltonian.formulas import TracedHamiltonian
+    from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
+
+__all__ = ["OnInterval", "Ranges", "on_interval", "position_ranges"]
 
 Ranges = tuple[tuple[float, float], ...]
 """The interval of q1 in which kicks are computed by polynomials; none for none."""
@@ -25,16 +31,14 @@ EXACT = 2.0**-54  # of the largest value
 AMPLIFIED = 16.0  # by so much rounding errors may grow
 STATES, MARGIN = 1000, 0.05  # of a domain whose positions, with a margin on both sides, are a range
 
-UNTOUCHED = (sp.Piecewise, sp.Max, sp.Min, sp.Abs, sp.Heaviside, sp.sign)
-"""Functions with kinks, of which an expression is left as it is."""
 
-
-def position_ranges(symbols: SymbolicHamiltonian, domain: Domain) -> Ranges:
+def position_ranges(form: SymbolicHamiltonian | TracedHamiltonian | None, domain: Domain) -> Ranges:
     """The interval of the position in a domain of one degree of freedom; none for an H that makes no use of it."""
-    assert symbols.V is not None
-    if symbols.ndof > 1 or symbols.timed or symbols.V.is_polynomial(*symbols.q) or symbols.V.has(*UNTOUCHED):
+    assert form is not None
+    assert form.V is not None
+    if form.ndof > 1 or form.time is not None or form.V.is_polynomial(*form.q):
         return ()
-    q = domain.sample(STATES, 0)[:, : symbols.ndof]
+    q = domain.sample(STATES, 0)[:, : form.ndof]
     margin = MARGIN * (q.max(0) - q.min(0))
     return tuple(zip((q.min(0) - margin).tolist(), (q.max(0) + margin).tolist(), strict=True))
 
@@ -49,26 +53,51 @@ class OnInterval:
     coefficients: np.ndarray
 
 
-def on_interval(functions: Sequence[sp.Expr], x: sp.Symbol, low: float, high: float) -> OnInterval | None:
-    """Functions of x as polynomials on [low, high] whose errors are below rounding; None where there are none.
+class _Precise(Number):
+    """A number in the arithmetic of mpmath."""
+
+    def __init__(self, value: Any) -> None:
+        self.value = value
+
+    def apply(self, name: str, args: Sequence[Any]) -> _Precise:
+        values = [x.value if isinstance(x, _Precise) else x for x in args]
+        return _Precise(_OPERATIONS[name](*values) if name in _OPERATIONS else getattr(mp, _SAME[name])(*values))
+
+
+_OPERATIONS: dict[str, Callable[..., Any]] = {
+    **{"add": operator.add, "sub": operator.sub, "mul": operator.mul, "times": operator.mul, "neg": operator.neg},
+    **{"div": operator.truediv, "pow": operator.pow, "fma": lambda x, y, z: x * y + z},
+    **{"expit": lambda x: 1 / (1 + mp.exp(-x)), "bose": lambda x: 1 / mp.expm1(x)},
+    **{"softplus": lambda x: mp.log(1 + mp.exp(x)), "logcosh": lambda x: mp.log(mp.cosh(x))},
+}
+_SAME = {
+    name: name
+    for name in (
+        *("sqrt", "exp", "expm1", "log", "log1p", "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh"),
+        *("asinh", "acosh", "atanh", "sech", "csch", "erf", "erfc", "gamma", "digamma", "ellipk", "ellipe", "hyp2f1"),
+    )
+}
+"""Functions that mpmath has by the same name; of others, as those with kinks, there are no polynomials."""
+
+
+def on_interval(functions: Program, low: float, high: float) -> OnInterval | None:
+    """Functions of one number as polynomials on [low, high] whose errors are below rounding; None if there are none.
 
     Each function is to enter with a factor at least `AMPLIFIED` times less than that before, as the terms of a kick do:
     its errors may be larger by that. Coefficients are those of Chebyshev interpolants, in powers of x less the middle.
     """
-    from mpmath import mp
-
     if abs(low + high) < 0.1 * (high - low):
         low, high = -max(-low, high), max(-low, high)
     center, half = 0.5 * (low + high), 0.5 * (high - low)
     with mp.workdps(DIGITS):
-        values = sp.lambdify(x, [printable(f) for f in functions], "mpmath")
         cosines = _cosines()
         try:
-            rows = [values(mp.mpf(center) + mp.mpf(half) * c) for c in cosines[1]]
+            rows = [functions(_Precise(mp.mpf(center) + mp.mpf(half) * c)) for c in cosines[1]]
+            numbers = [[mp.mpf(x.value if isinstance(x, _Precise) else x) for x in row] for row in rows]
             found = [
-                _powers([mp.mpf(row[k]) for row in rows], cosines, half, AMPLIFIED**k) for k in range(len(functions))
+                _powers(column, cosines, half, AMPLIFIED**k) for k, column in enumerate(zip(*numbers, strict=True))
             ]
-        except (ArithmeticError, TypeError, ValueError, NameError):  # not defined, or not real, everywhere
+        except (ArithmeticError, TypeError, ValueError, LookupError):  # not defined, or not real, everywhere
             return None
     if any(c is None for c in found):
         return None
@@ -80,16 +109,12 @@ def on_interval(functions: Sequence[sp.Expr], x: sp.Symbol, low: float, high: fl
 @cache
 def _cosines() -> list[list[Any]]:
     """cos(k a) of the angles a of the nodes, for k = 0, 1, …"""
-    from mpmath import mp
-
     angles = [(mp.mpf(2 * i + 1) / (2 * NODES)) * mp.pi for i in range(NODES)]
     return [[mp.cos(k * a) for a in angles] for k in range(NODES)]
 
 
 def _powers(values: Sequence[Any], cosines: Sequence[Sequence[Any]], half: float, less: float) -> list[float] | None:
     """The coefficients in powers of x of a function by its values, whose errors count `less`; None if too long."""
-    from mpmath import mp
-
     largest = max(abs(v) for v in values)
     if largest == 0:
         return [0.0]

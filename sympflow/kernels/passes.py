@@ -8,8 +8,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sympflow.compiler import NotCompiled
 from sympflow.compiler.control import BOOL, INT, POINTER
 from sympflow.compiler.machine import address
+from sympflow.compiler.program import Program
+from sympflow.hamiltonian.formulas import TracedHamiltonian, recorded
 from sympflow.kernels.runs import Lanes, begun, finished, groups
 from sympflow.lazy import kept
 
@@ -32,14 +35,14 @@ def all_within(system: HamiltonianSystem, domain: Box | EnergySublevel, states: 
     """
     from sympflow.hamiltonian.domain import Box
 
-    symbols, width = system.symbols, states.shape[-1]
+    form, width = system.form, states.shape[-1]
     within: Callable[..., None] | None = None
     if isinstance(domain, Box):
         (low, high), within = domain.bounds, _box_function(width)
     else:
         low, high = domain.limits(slack)
-        if symbols is not None and (domain.hamiltonian is None or domain.hamiltonian == system.hamiltonian):
-            within = _sublevel_function(symbols)
+        if form is not None and (domain.hamiltonian is None or domain.hamiltonian == system.hamiltonian):
+            within = _sublevel_function(form)
     if within is None or states.dtype != np.float64 or len(low) != width + 2 * (not isinstance(domain, Box)):
         return False
     rows, inside = np.ascontiguousarray(states), np.zeros(1, dtype=np.int64)
@@ -53,18 +56,16 @@ def _box_function(width: int) -> Callable[..., None]:
 
 
 @kept
-def _sublevel_function(symbols: SymbolicHamiltonian) -> Callable[..., None] | None:
+def _sublevel_function(form: SymbolicHamiltonian | TracedHamiltonian) -> Callable[..., None] | None:
     """The test of an H; None if that cannot be recorded or is long."""
-    import sympy as sp
-
-    from sympflow.hamiltonian.recorded import can_be_recorded
-
-    if not can_be_recorded(symbols.H) or sp.count_ops(symbols.H) > MOST_OPERATIONS:
+    try:
+        H = recorded([form.H], (*form.q, *form.p))
+    except NotCompiled:
         return None
-    return _within_function(2 * symbols.ndof, symbols)
+    return None if len(H) > MOST_OPERATIONS else _within_function(2 * form.ndof, H)
 
 
-def _within_function(n: int, symbols: SymbolicHamiltonian | None) -> Callable[..., None]:
+def _within_function(n: int, H: Program | None) -> Callable[..., None]:
     """Compile the test of rows of n numbers, and of H and, in a plane, |L|, of (rows, n_rows, low, high, inside)."""
     code = begun("within", [POINTER, INT, POINTER, POINTER, POINTER])
     rows, n_rows, low, high, result = code.arguments
@@ -72,14 +73,12 @@ def _within_function(n: int, symbols: SymbolicHamiltonian | None) -> Callable[..
     inside = code.variable(code.constant(1, BOOL))
     with code.over(groups(code, n_rows, LANES)) as group:
         x = lanes.loaded(rows, group * LANES, n_rows)
-        least, most = ([code.load(bound, i) for i in range(n if symbols is None else n + 2)] for bound in (low, high))
+        least, most = ([code.load(bound, i) for i in range(n if H is None else n + 2)] for bound in (low, high))
         outside = [~((a <= value) & (value <= b)) for a, value, b in zip(least, x, most, strict=False)]
-        if symbols is not None:
-            from sympflow.hamiltonian.formulas import evaluator
-
-            H = evaluator(dict(zip(symbols.q + symbols.p, x, strict=True)))(symbols.H)
-            outside.append(~((least[n] < H) & (most[n] > H)))
-        if symbols is not None and n == 4:
+        if H is not None:
+            (energy,) = H(*x)
+            outside.append(~((least[n] < energy) & (most[n] > energy)))
+        if H is not None and n == 4:
             L = abs(x[0] * x[3] - x[1] * x[2])
             outside.append(~((least[5] <= L) & (most[5] >= L)))
         any_out = outside[0]

@@ -227,7 +227,7 @@ class SplittingLoops:
         ndim, driving = self.friction.kind, self._driving
         if self._written is not None:
             return self._written(level, monomials, compensated, ndim)
-        form: Any = self._form.written if ranges and isinstance(self._form, TracedHamiltonian) else self._form
+        form = self._form
         symbols = form.parametric if parametric and driving is None and not ranges else form
         return Splitting(symbols, level, monomials, compensated, ndim, driving, ranges)
 
@@ -250,7 +250,7 @@ class SplittingLoops:
             return ()
         from sympflow.kernels.approximations import position_ranges
 
-        return position_ranges(system.symbols, system.domain)
+        return position_ranges(system.form, system.domain)
 
     def rows(
         self, table: StageTable, h: float = 1.0, t0: float = 0.0, varied: bool = False, ranges: Ranges | None = None

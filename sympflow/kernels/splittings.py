@@ -167,7 +167,7 @@ class Splitting:
         """The stage as a polynomial in its range, if there is one."""
         from sympflow.kernels.approximations import on_interval
 
-        near = on_interval(_of_kick(self.symbols, terms), self.symbols.q[0], *self.ranges[0])
+        near = on_interval(_of_kick(self.symbols, terms), *self.ranges[0])
         if near is None:
             return self._arranged(terms)
         arranged = NearShape(self, terms, near).arranged()[1]
@@ -343,14 +343,19 @@ class WithinRange:
         return self._exact.plain(*numbers[:n], *numbers[n + here :])
 
 
-def _of_kick(symbols: Any, terms: int) -> list[Any]:
+def _of_kick(symbols: Any, terms: int) -> Program:
     """V′, V″M⁻¹V′ and (½ V′M⁻¹V″M⁻¹V′)′ of one position, as many as there are terms."""
-    V, M = symbols.V, symbols.inverse_mass
-    slope = V.diff(symbols.q[0])
-    if terms == 1 or M is None:
-        return [slope]
-    product = slope.diff(symbols.q[0]) * M[0, 0] * slope
-    return [slope, product, (slope * M[0, 0] * product / 2).diff(symbols.q[0])][:terms]
+
+    def values(q: Traced) -> list[Any]:
+        known = evaluator({symbols.q[0]: q})
+        (slope,) = gradient(known(symbols.V), [q])
+        if terms == 1 or symbols.inverse_mass is None:
+            return [slope]
+        v = known(symbols.inverse_mass[0, 0]) * slope
+        product = gradient(slope, [q])[0] * v
+        return [slope, product, *gradient(v * product * 0.5, [q])][:terms]
+
+    return traced(values, symbols.q[0].name)
 
 
 def _kick_changes(

@@ -88,7 +88,7 @@ def chosen_trial(system: HamiltonianSystem, domain: Domain, session: Session | N
     assert system.symbols is not None
     starts: list[Resolved] = tried_starts(system, domain, curvature=False)
     try:
-        ranges = position_ranges(system.symbols, domain)
+        ranges = position_ranges(system.form, domain)
         loops = splitting_loops(system)
         costs = [loops.kick_cycles(level, ranges if level else ()) for level in (0, FORCE_GRADIENT, CURVATURE)]
     except NotCompiled:
