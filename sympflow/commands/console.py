@@ -46,6 +46,8 @@ PHRASES: dict[str, str | Callable[[re.Match[str]], str]] = {
     "[domain] of a .toml file for instance",
     r"Join q and p along the last axis, np\.concatenate\(\[q, p\], axis=-1\)": "Give all q and then all p, with commas",
     r"Pass the states themselves": "Give --batch 0",
+    r"give the mass matrix as `velocity_mass`, by which p = M v, or columns p1 …; or pass observed=\"qv\" to `learn`, "
+    r"which finds M|pass velocity_mass=\[…\], by which p = M v": 'pass observed="qv", by which masses are found',
     r"flow\.certificate\(system\)": "`sympflow certificate`",
     r'damping="quadratic"': "`--drag`",
     r"period=2\*np\.pi": "period=6.283185307179586",

@@ -304,9 +304,6 @@ class TracedHamiltonian:
 class TracedPoles:
     """The places of H as it was traced: divisors and the like, and once a run may have passed one, those in symbols."""
 
-    cancelling: Sequence[Any] = ()
-    watched = True
-
     def __init__(self, form: TracedHamiltonian) -> None:
         self._form, program = form, form.H.program
         inputs, self._vanishing = program.inputs[form.time is not None :], dict[int, Traced]()

@@ -185,7 +185,7 @@ class LatticeHamiltonian(LocalHamiltonian):
         return LatticePoles(self) or None
 
     def remark(self, q: np.ndarray) -> str:
-        if self.poles is None or not self.poles.watched:
+        if not self.poles:
             return ""
         nearest = LatticePoles(self).nearest(q)
         return f"{nearest} is nearest to a place where V is infinite: take shorter steps, or another `y0`."

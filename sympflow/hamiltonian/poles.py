@@ -11,7 +11,7 @@ import mpmath
 import numpy as np
 import sympy as sp
 
-from sympflow.hamiltonian.removable import Min, bose, elliptic_e, elliptic_k
+from sympflow.hamiltonian.removable import BOUNDED_VALUES, Min, X, bose, elliptic_e, elliptic_k, removed
 
 FACTORED = 8  # letters of a polynomial, at most, that is split into factors
 MOST_SHOWN = 100  # characters of terms
@@ -30,43 +30,11 @@ class Place(NamedTuple):
     cell: sp.Expr
 
 
-class Cancelling(NamedTuple):
-    """Terms f of H in one letter s that are infinite at a value of s where their sum is not; and where that letter is.
-
-    `letter` is its number among those of H, or of U of a lattice, or of a bond of length `bond`, or of V of a pair.
-    """
-
-    f: sp.Expr
-    s: sp.Symbol
-    at: float
-    letter: int
-    bond: int | None = None
-
-    @property
-    def name(self) -> str:
-        """The terms and the place, in words that go before a colon."""
-        text = _written(self.f)
-        return f"at {self.s} = {self.at:.6g}, {text if len(text) < MOST_SHOWN else text[:MOST_SHOWN] + ' …'}"
-
-    def loss(self, distance: float, visited: np.ndarray) -> float:
-        """The error of ∂f/∂s at a distance from the value, beside what it is at values (n,) of s."""
-        double, exact = _slopes(self.f, self.s)
-        x = self.at + np.concatenate([side * distance * np.linspace(0.5, 2.0, 16) for side in (-1, 1)])
-        with np.errstate(all="ignore"), mpmath.workdps(DIGITS):
-            right = [complex(exact(mpmath.mpf(v))) for v in x.tolist()]
-            error = np.abs(np.broadcast_to(double(x), x.shape) - right)
-            size = np.abs(np.broadcast_to(double(visited), visited.shape))
-        return float(np.nanmax(error) / np.nanmedian(size))
-
-
 class Places(Protocol):
     """The places at which H of a system may be infinite, in columns, as runs look at them."""
 
-    cancelling: Sequence[Cancelling]  # terms of H that cancel where each is infinite
-    watched: bool  # False if H has cancelling terms alone
-
     def __bool__(self) -> bool:
-        return self.watched or bool(self.cancelling)
+        """False if H has none."""
 
     @property
     def exact(self) -> Poles | None:
@@ -106,9 +74,6 @@ class Poles(Places, Protocol):
     def name(self, column: int) -> str:
         """The place, in words that go before "passed"."""
 
-    def visited(self, terms: Cancelling, y: np.ndarray) -> np.ndarray:
-        """The values (..., m) of the letter of terms that cancel, at states (..., 2d)."""
-
 
 class SymbolicPoles(Poles):
     """The places of H, as it is written."""
@@ -118,8 +83,7 @@ class SymbolicPoles(Poles):
         letters = (*symbols.q, *symbols.p, *((symbols.time,) if symbols.timed else ()))
         parts = [symbols.V, symbols.T] if symbols.separable else [symbols.H]
         self._letters, self._places = letters, [(place, f) for f in parts for place in places(f, letters)]
-        self._m, self.watched = len(self._places), bool(self._places)
-        self.cancelling = [c for f in parts for c in cancelling(f, letters)]
+        self._m = len(self._places)
         if not self._places:
             return
         T = symbols.T if symbols.separable else sp.Add(*[sp.Abs(s * sp.diff(symbols.H, s)) for s in letters])
@@ -128,6 +92,9 @@ class SymbolicPoles(Poles):
         states = {*symbols.q, *symbols.p}  # a place in t alone is crossed, or met by none of the steps
         sizes = [place.g if place.g.free_symbols & states else sp.S.One for place, _ in self._places]
         self._sizes = symbols.evaluated("sizes", sizes)
+
+    def __bool__(self) -> bool:
+        return bool(self._places)
 
     def look(self, y: np.ndarray, t: Any, numbers: Sequence[Any] = ()) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         values = self._look(y, *self._time(y, t), numbers=numbers)
@@ -155,9 +122,6 @@ class SymbolicPoles(Poles):
     def name(self, column: int) -> str:
         return f"{_written(self._places[column][0].g)} = 0"
 
-    def visited(self, terms: Cancelling, y: np.ndarray) -> np.ndarray:
-        return y[..., [terms.letter]]
-
     def _time(self, y: np.ndarray, t: Any) -> tuple[Any, ...]:
         return (np.broadcast_to(t, y.shape[:-1]),) if self._symbols.timed else ()
 
@@ -167,18 +131,11 @@ class LatticePoles(Poles):
 
     def __init__(self, lattice: Any) -> None:
         self._lattice = lattice
-        terms = [(None, lattice.U, lattice.x), *((k, V, lattice.r) for k, V in lattice.bonds.items())]
-        self.watched = any(places(f, x) for _, f, x in terms)
-        self.cancelling = []
-        for k, f, x in terms:
-            names = [sp.Symbol(name, real=True) for name in lattice.names["x" if k is None else "r"]]
-            named = _with_numbers(f, lattice.c, lattice.params).xreplace(dict(zip(x, names, strict=True)))
-            self.cancelling += [each._replace(bond=k) for each in cancelling(named, tuple(names))]
+        terms = [(lattice.U, lattice.x), *((V, lattice.r) for V in lattice.bonds.values())]
+        self._any = any(places(f, x) for f, x in terms)
 
-    def visited(self, terms: Cancelling, y: np.ndarray) -> np.ndarray:
-        rows = self._lattice.of_terms("own", lambda f, x: [*x], self._positions(y))
-        found = [values[terms.letter] for axis, k, values in rows if terms.bond == (None if axis is None else k)]
-        return np.concatenate([value.reshape(*y.shape[:-1], -1) for value in found], axis=-1)
+    def __bool__(self) -> bool:
+        return self._any
 
     def look(self, y: np.ndarray, t: Any, numbers: Sequence[Any] = ()) -> tuple[np.ndarray, np.ndarray, None]:
         cells = self._columns("cells", _cells, y)
@@ -245,18 +202,19 @@ class LatticePoles(Poles):
 
 
 class PairsPoles(Poles):
-    """The places of V of two bodies, at a distance r or, of free bodies on a line, a difference."""
+    """The places of V of two bodies, at a distance that changes its sign where they pass each other on a line."""
 
     def __init__(self, pairs: Any) -> None:
         self._pairs, self._x = pairs, sp.Symbol("r", real=True)
-        self._on_a_line = pairs.dim == 1 and pairs.signed
-        own = [s for s in pairs.of_distance.free_symbols if s.name == "r"]
-        self._f = pairs.of_distance.xreplace({s: sp.Abs(self._x) if self._on_a_line else self._x for s in own})
-        found, self._meeting = places(self._f, (self._x,)), sp.sign(self._x)
-        self._places = [place for place in found if pairs.signed or place.cell != self._meeting]
-        self.watched = bool(self._places)
-        self._only_meet = not self._on_a_line and [place.cell for place in self._places] == [self._meeting]
-        self.cancelling = cancelling(_with_numbers(self._f, pairs.c, pairs.params), (self._x,))
+        f = pairs.of_distance.xreplace({s: self._x for s in pairs.of_distance.free_symbols if s.name == "r"})
+        distance, meeting = {self._x: sp.Abs(self._x)}, sp.sign(self._x)
+        found = [place for place in places(f, (self._x,)) if pairs.signed or place.cell != meeting]
+        self._f = f.xreplace(distance)
+        self._places = [Place(place.g, meeting * place.cell.xreplace(distance)) for place in found]
+        self._only_meet = pairs.dim > 1 and [place.cell for place in found] == [meeting]
+
+    def __bool__(self) -> bool:
+        return bool(self._places)
 
     def may_pass(self, y: np.ndarray) -> bool:
         return not self._only_meet or self._pairs.may_pass(y)
@@ -276,13 +234,11 @@ class PairsPoles(Poles):
 
     def passed(self, column: int, t: Sequence[float], y: np.ndarray) -> bool:
         names, cell = (self._x, *self._pairs.first, *self._pairs.second, *self._pairs.c), self._places[column].cell
-        f = self._f.xreplace({self._x: sp.Abs(self._x)}) if cell == self._meeting else self._f
         for _, _, x, letters in self._pairs.met(y, together=True):
             cells = self._cells(x, letters)[column]
-            x = x if self._on_a_line or cell == self._meeting else np.abs(x)  # noqa: PLW2901
             for k in np.flatnonzero(cells[0] != cells[1])[:MOST_MET]:
                 own = [float(np.broadcast_to(v, x.shape)[0, k]) for v in letters]
-                if infinite_between(f, cell, names, *([float(v), *own] for v in x[:, k])):
+                if infinite_between(self._f, cell, names, *([float(v), *own] for v in x[:, k])):
                     return True
         return False
 
@@ -290,20 +246,8 @@ class PairsPoles(Poles):
         names = dict(zip(self._pairs.c, map(sp.Symbol, self._pairs.params), strict=False))
         return f"{_written(self._places[column].g.xreplace(names))} = 0 of two bodies"
 
-    def visited(self, terms: Cancelling, y: np.ndarray) -> np.ndarray:
-        found = np.concatenate([x for _, _, x, _ in self._pairs.met(y)], axis=-1)
-        return found if self._on_a_line else np.abs(found)
-
     def _cells(self, x: np.ndarray, letters: Sequence[Any]) -> list[np.ndarray]:
-        cells, r = [place.cell for place in self._places], x if self._on_a_line else np.abs(x)
-        found = self._pairs.values_of("cells", cells, self._x, r, letters)
-        return [np.sign(x) if cell == self._meeting else value for cell, value in zip(cells, found, strict=True)]
-
-
-def _with_numbers(f: sp.Expr, letters: Sequence[sp.Symbol], params: Any) -> sp.Expr:
-    """An expression with the values of its parameters, of those that are numbers."""
-    values = zip(letters, params.values(), strict=False)
-    return f.xreplace({s: sp.Float(float(v)) for s, v in values if np.ndim(v) == 0})
+        return self._pairs.values_of("cells", [place.cell for place in self._places], self._x, x, letters)
 
 
 def _cells(f: sp.Expr, x: tuple[sp.Symbol, ...]) -> list[sp.Expr]:
@@ -355,29 +299,18 @@ _ODD = sp.sinh, sp.tanh, sp.asinh, sp.atan, sp.erf, sp.sign
 @lru_cache(maxsize=64)
 def places(f: sp.Expr, x: tuple[sp.Symbol, ...]) -> tuple[Place, ...]:
     """The places where f may be infinite or not a number, as far as they are found, by letters of x."""
-    return tuple(place for place in _places(f, x) if _removable(f, place) is None)
-
-
-def cancelling(f: sp.Expr, x: tuple[sp.Symbol, ...]) -> list[Cancelling]:
-    """The terms of f that cancel where a letter of x has a value, as those of csch(q) - 1/q at 0."""
-    found = []
-    for place in _places(f, x):
-        if (terms := _removable(f, place)) is not None:
-            (s,) = terms.free_symbols
-            found.append(Cancelling(terms, s, _root(place, s), x.index(s)))
-    return found
-
-
-@lru_cache(maxsize=64)
-def _places(f: sp.Expr, x: tuple[sp.Symbol, ...]) -> tuple[Place, ...]:
     found = [g for function in f.atoms(*_SINGULAR) for g in _SINGULAR[function.func](*function.args)]
     for power in f.atoms(sp.Pow):
         if power.exp.could_extract_minus_sign() or (
             power.exp.is_integer is False and power.base.is_nonnegative is not True
         ):
             found.append(power.base)
+    for part in f.atoms(removed):
+        beside = [place.g for place in places(part.formula, (X,)) if place.g.subs(X, 0) != 0]
+        found += [g.xreplace({X: part.args[1]}) for g in beside]
     by_cell = {place.cell: place for g in found for place in _split(g, x)}
-    return tuple(sorted(by_cell.values(), key=lambda place: sp.default_sort_key(place.cell)))
+    infinite = [place for place in by_cell.values() if not _removable(f, place)]
+    return tuple(sorted(infinite, key=lambda place: sp.default_sort_key(place.cell)))
 
 
 def _split(g: sp.Expr, x: tuple[sp.Symbol, ...]) -> Iterator[Place]:
@@ -460,18 +393,18 @@ def _root(place: Place, s: sp.Symbol) -> float:
 
 
 @lru_cache(maxsize=256)
-def _removable(f: sp.Expr, place: Place) -> sp.Expr | None:
-    """The terms of f in the one letter of a linear g, if their sum is finite where it vanishes, as sin(r)/r at 0."""
+def _removable(f: sp.Expr, place: Place) -> bool:
+    """Return True if the terms of f in the one letter of a linear g are finite where it vanishes, as exp(-1/q**2)."""
     if not isinstance(place.cell, sp.sign) or len(place.g.free_symbols) != 1:
-        return None
+        return False
     (s,) = place.g.free_symbols
     f = sp.Add(*[term for term in sp.Add.make_args(f) if term.has(s)])
     g = place.cell.args[0]
     if f.free_symbols != {s} or not g.is_polynomial(s) or sp.degree(g, s) != 1:
-        return None
+        return False
     root = _root(place, s)
     width = abs(root) or 1.0
-    return None if infinite_between(f, place.cell, (s,), [root - width], [root + width]) else f
+    return not infinite_between(f, place.cell, (s,), [root - width], [root + width])
 
 
 def infinite_between(
@@ -504,39 +437,9 @@ def infinite_between(
     return False
 
 
-def _bounded(name: str) -> Callable[[Any], Any]:
-    """A function of mpmath for which numbers beyond double precision are infinite: of them it would need hours."""
-    function, limits = getattr(mpmath, name), _LIMITS.get(name)
-
-    def value(x: Any) -> Any:
-        x = mpmath.mpmathify(x)
-        if mpmath.im(x) != 0 or not mpmath.isfinite(x) or abs(x) < LARGEST:
-            return function(x)
-        if limits is None or (limit := limits[x > 0]) is None:
-            raise OverflowError(name)
-        return mpmath.mpf(limit)
-
-    return value
-
-
-_LIMITS: dict[str, tuple[float | None, float | None]] = {
-    "exp": (0.0, None), "tanh": (-1.0, 1.0), "coth": (-1.0, 1.0), "sech": (0.0, 0.0), "csch": (0.0, 0.0),
-}  # fmt: skip
-"""Limits at −∞ and ∞; None is infinite."""
-LARGEST = mpmath.mpf(2) ** 1024
-_BOUNDED = {name: _bounded(name) for name in ("sin", "cos", "tan", "cot", "sec", "csc", "sinh", "cosh", *_LIMITS)}
-
-
 @lru_cache(maxsize=256)
 def _precise(f: sp.Expr, cell: sp.Expr, letters: tuple[sp.Symbol, ...]) -> tuple[Any, Any]:
     """f and the number of the cell, in the arithmetic of mpmath; samples, which are bounded, are left out."""
     f = f.replace(lambda e: type(e).__name__ == "sampled", lambda _: sp.S.One)
-    function, number = (sp.lambdify(letters, e, [_BOUNDED, "mpmath"]) for e in (f, cell))
+    function, number = (sp.lambdify(letters, e, [BOUNDED_VALUES, "mpmath"]) for e in (f, cell))
     return function, number
-
-
-@lru_cache(maxsize=64)
-def _slopes(f: sp.Expr, s: sp.Symbol) -> tuple[Any, Any]:
-    """The derivative of f in double precision, and in the arithmetic of mpmath."""
-    slope = sp.diff(f, s).replace(sp.DiracDelta, lambda *_: sp.S.Zero)
-    return tuple(sp.lambdify(s, slope, modules) for modules in (["scipy", np], [_BOUNDED, "mpmath"]))

@@ -23,7 +23,7 @@ from sympflow.hamiltonian.removable import (
     expit,
     hyp2f1,
     logcosh,
-    sinc,
+    removed,
     softplus,
     triangle,
 )
@@ -106,7 +106,7 @@ def _heaviside(x: Any, at_zero: Any = 0.5) -> Any:
 def can_be_recorded(f: sp.Expr) -> bool:
     """True if `calculated` has a rule for every function in an expression."""
     functions = f.atoms(sp.Function, sp.logic.boolalg.Boolean) - f.atoms(sp.Symbol)
-    known = (sp.Piecewise, sp.Heaviside, sinc, sp.logic.boolalg.BooleanAtom)
+    known = (sp.Piecewise, sp.Heaviside, removed, sp.logic.boolalg.BooleanAtom)
     return all(a.func in _RULES or isinstance(a, known) for a in functions) and all(_takes_order(a) for a in functions)
 
 
@@ -144,7 +144,7 @@ def calculated(f: sp.Basic, value: Callable[[sp.Basic], Any]) -> Any:
         return apply("pow", value(base), value(exponent))
     if isinstance(f, sp.Piecewise):
         return _piecewise(f, value)
-    if isinstance(f, sinc):
+    if isinstance(f, removed):
         return value(f.written_out)
     if isinstance(f, sp.Heaviside):
         return _heaviside(*(value(x) for x in f.args))

@@ -4,51 +4,98 @@ integrals with derivatives at 0, and quotients of exponentials that do not overf
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from functools import lru_cache, reduce
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from functools import lru_cache
 from typing import Any
 
+import mpmath
 import sympy as sp
 from sympy.codegen.cfunctions import expm1, log1p
 from sympy.core.sorting import ordered
+from sympy.printing.precedence import PRECEDENCE
 
-_X = sp.Symbol("x", real=True)
-TERMS = 14  # of the series of sin(x)/x, enough for its first derivatives too
-SERIES_UP_TO = 2.0
+X = sp.Symbol("x", real=True)
+DIGITS, SAMPLES, LOWEST, COEFFICIENTS = 60, 192, 16, 48  # digits, values and powers, that give a series
+CIRCLES = 1.0, 0.25, 2.0**-4, 2.0**-7, 2.0**-10  # radii on which a function is sampled
+ALIKE = 1e-8  # relative difference, at most, of values beside a place where the function is finite
+NOISE, VANISHING = 1e-50, 1e-20  # of coefficients of a series: of rounding, and of powers that it should not have
+TAIL, LONGEST = 1e-20, 2.0  # share that a series leaves out, and the largest radius within which it is taken
+MOST_TERMS = 64  # of a sum, each infinite at a place, that are compared with each other
 
 
-class sinc(sp.Function):
-    """The n-th derivative of sin(x)/x: its series where |x| < 2, beyond by n f⁽ⁿ⁻¹⁾ + x f⁽ⁿ⁾ = sin⁽ⁿ⁾ x."""
+def _bounded(name: str) -> Callable[[Any], Any]:
+    """A function of mpmath for which numbers beyond double precision are infinite: of them it would need hours."""
+    function, limits = getattr(mpmath, name), _LIMITS.get(name)
 
-    nargs = (1, 2)
+    def value(x: Any) -> Any:
+        x = mpmath.mpmathify(x)
+        if mpmath.im(x) != 0 or not mpmath.isfinite(x) or abs(x) < LARGEST:
+            return function(x)
+        if limits is None or (limit := limits[x > 0]) is None:
+            raise OverflowError(name)
+        return mpmath.mpf(limit)
+
+    return value
+
+
+_LIMITS: dict[str, tuple[float | None, float | None]] = {
+    "exp": (0.0, None), "tanh": (-1.0, 1.0), "coth": (-1.0, 1.0), "sech": (0.0, 0.0), "csch": (0.0, 0.0),
+}  # fmt: skip
+"""Limits at −∞ and ∞; None is infinite."""
+LARGEST = mpmath.mpf(2) ** 1024
+BOUNDED_VALUES = {name: _bounded(name) for name in ("sin", "cos", "tan", "cot", "sec", "csc", "sinh", "cosh", *_LIMITS)}
+
+
+class _Formula(sp.Atom):
+    """A function of x, which is no part of the expression that holds it."""
+
+    def __new__(cls, f: sp.Expr) -> _Formula:
+        made = super().__new__(cls)
+        made.f = f
+        return made
+
+    def _hashable_content(self) -> tuple[sp.Expr]:
+        return (self.f,)
+
+    def _sympystr(self, printer: Any) -> str:
+        return f"{type(self).__name__}({printer._print(self.f)})"
+
+    _sympyrepr = _sympystr
+
+
+class removed(sp.Function):
+    """The n-th derivative, at a, of a function of x that is finite at 0, but 0/0 or ∞ − ∞: near 0 by its series."""
+
+    nargs = 3
     is_real = True
 
     @classmethod
-    def eval(cls, x: sp.Expr, n: sp.Expr = sp.S.Zero) -> sp.Expr | None:
-        if x.is_number:
-            s = sp.Dummy(real=True)
-            return sp.sinc(s).diff(s, n).subs(s, x)
-        if x.could_extract_minus_sign():
-            return (-1) ** n * cls(-x, n)
-        return None
+    def eval(cls, formula: _Formula, a: sp.Expr, n: sp.Expr) -> sp.Expr | None:
+        if a.is_Pow and a.exp == sp.S.Half and not any(_coefficients(formula.f)[1::2]):
+            return cls(_Formula(formula.f.xreplace({X: sp.sqrt(X)})), a.base, n) if n == 0 else None
+        if not a.is_number:
+            return None
+        radius, series = _series(formula.f, int(n))
+        return series.xreplace({X: a}) if abs(a) < radius else formula.f.diff(X, n).xreplace({X: a})
+
+    def _eval_derivative(self, s: sp.Symbol) -> sp.Expr:
+        formula, a, n = self.args
+        return removed(formula, a, n + 1) * a.diff(s)
 
     @property
-    def order(self) -> int:
-        return int(self.args[1]) if len(self.args) == 2 else 0
-
-    def fdiff(self, argindex: int = 1) -> sp.Expr:
-        return sinc(self.args[0], self.order + 1)
+    def formula(self) -> sp.Expr:
+        """The function of x, whatever its argument is."""
+        formula, _, n = self.args
+        return _without_overflow(formula.f.diff(X, n))
 
     @property
     def written_out(self) -> sp.Expr:
         """The same in functions that code has, each branch finite wherever it is evaluated."""
-        x, n = self.args[0], self.order
-        series, beyond = _branches(n)
-        far = {_X: Max(abs(x), SERIES_UP_TO / 2)}
-        return sp.Piecewise(
-            (series.xreplace({_X: Max(Min(x, 2 * SERIES_UP_TO), -2 * SERIES_UP_TO)}), abs(x) < SERIES_UP_TO),
-            (beyond.xreplace(far) * (sp.sign(x) if n % 2 else 1), True),
-        )
+        formula, a, n = self.args
+        radius, series = _series(formula.f, int(n))
+        near, far = Max(Min(a, radius), -radius), a + 2 * radius * Max(sp.sign(radius - sp.Abs(a)), 0)
+        return sp.Piecewise((series.xreplace({X: near}), sp.Abs(a) < radius), (self.formula.xreplace({X: far}), True))
 
     def _code(self, printer: Any) -> str:
         """The name by which SymPy's printers of code ask."""
@@ -57,17 +104,55 @@ class sinc(sp.Function):
 
     _pythoncode = _numpycode = _torchcode = _mpmathcode = _code
 
+    def _as_formula(self, printer: Any) -> str:
+        return printer.parenthesize(self.formula.xreplace({X: self.args[1]}), PRECEDENCE["Func"])
+
+    _sympystr = _latex = _as_formula
+
 
 @lru_cache
-def _branches(n: int) -> tuple[sp.Expr, sp.Expr]:
-    """The series of the n-th derivative by Horner's rule, and its formula beyond."""
-    powers = range((n + 1) // 2, TERMS + n)
-    factors = [sp.Float((-1) ** k * math.perm(2 * k, n) / math.factorial(2 * k + 1), 17) for k in powers]
-    series = reduce(lambda f, c: c + _X**2 * f, reversed(factors))
-    beyond = sp.S.Zero
-    for m in range(n + 1):
-        beyond = ((sp.sin(_X), sp.cos(_X), -sp.sin(_X), -sp.cos(_X))[m % 4] - m * beyond) / _X
-    return series * _X ** (n % 2), beyond
+def _series(f: sp.Expr, n: int = 0) -> tuple[float, sp.Expr]:
+    """The n-th derivative of the series of f by Horner's rule, and the radius within which it is taken."""
+    powers = [(k, c) for k, c in enumerate(_coefficients(f)) if c]
+    powers = [(k - n, c * math.perm(k, n)) for k, c in powers if k >= n] or [(0, mpmath.mpf(0))]
+    first, leading = powers[0]
+    last = [(k - first, abs(c / leading)) for k, c in powers[1:][-4:]]
+    radius = min([LONGEST, *(float((TAIL / c) ** (1 / mpmath.mpf(k))) for k, c in last)])
+    powers = [(k, c) for k, c in powers if abs(c) * radius ** (k - first) >= TAIL / 1000 * abs(leading)]
+    series, above = sp.S.Zero, powers[-1][0]
+    for k, c in reversed(powers):
+        series, above = sp.Float(c, 17) + X ** (above - k) * series, k
+    return radius, series * X**first
+
+
+@lru_cache
+def _coefficients(f: sp.Expr) -> tuple[Any, ...]:
+    """The Taylor coefficients of a function at 0, where it is 0/0 or ∞ − ∞; none of any other.
+
+    They are Cauchy's integrals, and those of negative powers must vanish.
+    """
+    exact = f.xreplace({a: sp.nsimplify(a, rational=True) for a in f.atoms(sp.Float)})
+    with mpmath.workdps(DIGITS), suppress(ArithmeticError, ValueError, TypeError, NameError):
+        function = sp.lambdify(X, exact, [BOUNDED_VALUES, "mpmath"])
+        with suppress(ZeroDivisionError):
+            if mpmath.isfinite(function(mpmath.mpf(0))):
+                return ()
+        beside = [function(mpmath.mpf(x)) for x in (1e-20, -1e-20, 1e-10)]
+        size = max(map(abs, beside))
+        if not all(mpmath.isfinite(y) and abs(y - beside[0]) <= ALIKE * (size + 1) for y in beside):
+            return ()
+        turns = [mpmath.expjpi(j / mpmath.mpf(SAMPLES)) for j in range(2 * SAMPLES)]
+        for radius in CIRCLES:
+            values = [(j, function(radius * turns[j])) for j in range(1, SAMPLES, 2)]
+            size = max(abs(y) for _, y in values)
+            means = {
+                k: sum((y * turns[-j * k % len(turns)]).real for j, y in values) * 2 / SAMPLES
+                for k in range(-LOWEST, COEFFICIENTS)
+            }
+            if all(abs(means[-k]) <= VANISHING * size for k in range(1, LOWEST)):
+                kept = [means[k] if abs(means[k]) > NOISE * size else 0 for k in range(COEFFICIENTS)]
+                return tuple(c / mpmath.mpf(radius) ** k for k, c in enumerate(kept))
+    return ()
 
 
 class _Smooth(sp.Function):
@@ -218,13 +303,14 @@ def with_own_functions(f: sp.Expr) -> sp.Expr:
                 x = sp.Wild("x")
                 f = f.replace(arc(wave(x)), sp.pi / 4 * (1 - sign) + sign * triangle(x + shift))
     f = f.replace(sp.elliptic_k, elliptic_k).replace(sp.elliptic_e, elliptic_e)
-    return _without_overflow(_with_sinc(_with_extrema(f)))
+    f = _without_overflow(_with_extrema(f.replace(sp.sinc, lambda x: sp.sin(x) / x)))
+    return _without_places(_without_places(f), divided=True)
 
 
 # quotients of exponentials --------------------------------------------------------------------------------------------
 
 
-def _without_overflow(f: sp.Expr) -> sp.Expr:
+def _without_overflow(f: sp.Expr) -> Any:
     """An expression whose logarithms, and quotients, of a sum of two exponentials are written by `BOUNDED`."""
     if f.has(sp.log) and f.has(sp.exp, sp.cosh):
         f = f.replace(sp.log, _logarithm)
@@ -334,64 +420,63 @@ def _with_extrema(f: sp.Basic) -> Any:
     return {sp.Max: Max, sp.Min: Min}.get(f.func, f.func)(*map(_with_extrema, f.args))
 
 
-def _with_sinc(f: sp.Expr) -> sp.Expr:
-    """An expression whose sin(a)/b and (1 − cos a)/b² are written by `sinc`, where a vanishes as b does."""
-    if f.has(sp.sinc):
-        f = f.replace(sp.sinc, sinc)
-    if not any(power.exp.is_negative and f.has(sp.sin, sp.cos) for power in f.atoms(sp.Pow)):
+# what is infinite at a place in parts alone ---------------------------------------------------------------------------
+
+
+_INFINITE = sp.csch, sp.coth, sp.csc, sp.cot, bose
+
+
+def _divisors(f: sp.Expr) -> list[sp.Expr]:
+    """Expressions where f, or a part of it, is infinite if they vanish."""
+    powers = [a.base for a in f.atoms(sp.Pow) if a.exp.is_number and a.exp.is_negative]
+    return [a for a in (*powers, *(a.args[0] for a in f.atoms(*_INFINITE))) if a.free_symbols]
+
+
+def _without_places(f: Any, divided: bool = False) -> Any:
+    """An expression whose products and sums that are finite where their parts are not are written by `removed`.
+
+    These are divided by other letters last, as q csch(kq) by k.
+    """
+    if not f.args or not _divisors(f):
         return f
-    f = f.replace(lambda e: e.is_Add and e.has(sp.cos), _joined)
-    return f.replace(lambda e: e.is_Mul and e.has(sp.sin, sp.cos), _divided)
-
-
-def _joined(f: sp.Add) -> sp.Expr:
-    """A sum in which x·cos a − x, with x divided by a power, is −2x sin²(a/2)."""
-    terms = list(f.args)
-    for term in f.args:
-        for wave in (a for a in sp.Mul.make_args(term) if isinstance(a, sp.cos)):
-            factor = term / wave
-            if -factor in terms and term in terms and any(a.is_Pow and a.exp.is_negative for a in factor.atoms(sp.Pow)):
-                terms.remove(-factor)
-                terms.remove(term)
-                terms.append(_divided(factor * (wave - 1)))
-    return sp.Add(*terms)
-
-
-def _divided(f: sp.Mul) -> sp.Expr:
-    """A product whose sines are divided by what vanishes with them."""
-    for sum_ in f.args:
-        square = _as_square(sum_)
-        if square is not None:
-            again = _divided(f / sum_ * square)
-            return f if again.has(*square.atoms(sp.sin)) else again
-    for factor in f.args:
-        wave, n = factor.as_base_exp()
-        if not isinstance(wave, sp.sin) or not (n.is_Integer and n > 0):
-            continue
-        for power in f.args:
-            base, e = power.as_base_exp()
-            for m in (sp.S.One, sp.S.Half):
-                if e.is_number and e <= -m and (ratio := _ratio(wave.args[0], base**m)) is not None:
-                    return _divided(f / wave / base**-m * sinc(wave.args[0]) * ratio)
+    if f.is_Mul or f.is_Pow:
+        return _finite([f], divided) or f.func(*(_without_places(x, divided) for x in f.args))
+    f = f.func(*(_without_places(x, divided) for x in f.args))
+    infinite = [term for term in f.args if _divisors(term)] if f.is_Add else []
+    if 1 < len(infinite) <= MOST_TERMS and (found := _finite(infinite, divided)) is not None:
+        return found + sp.Add(*(term for term in f.args if term not in infinite))
     return f
 
 
-def _as_square(f: sp.Expr) -> sp.Expr | None:
-    """c − c cos a as 2c sin²(a/2)."""
-    if not f.is_Add or len(f.args) != 2:
-        return None
-    for term, c in (f.args, f.args[::-1]):
-        for wave in (a for a in sp.Mul.make_args(term) if isinstance(a, sp.cos)):
-            if term == -c * wave:
-                return 2 * c * sp.sin(wave.args[0] / 2) ** 2
+def _finite(terms: Sequence[sp.Expr], divided: bool) -> sp.Expr | None:
+    """The sum of terms, some of them by `removed`; None if there is none that is 0/0 or ∞ − ∞ somewhere, and finite."""
+    divisors = [b for term in terms for b in _divisors(term)]
+    arguments = [f.args[0] for term in terms for f in term.atoms(sp.Function) if isinstance(f.args[0], sp.Expr)]
+    for a in dict.fromkeys((*arguments, *divisors)):
+        for with_x in _substitutions(a, set().union(*(b.free_symbols for b in divisors))):
+            groups: dict[sp.Expr, list[tuple[sp.Expr, sp.Expr]]] = {}
+            for term in terms:
+                changed = term.xreplace(with_x).replace(lambda e: e.is_Add and e.free_symbols > {X}, sp.expand)
+                alone = [b for b in sp.Mul.make_args(changed) if b.free_symbols <= {X}]
+                rest = sp.Mul(*(b for b in sp.Mul.make_args(changed) if b not in alone))
+                groups.setdefault(rest, []).append((term, sp.Mul(*alone)))
+            sums = {rest: sp.Add(*(alone for _, alone in group)) for rest, group in groups.items()}
+            found = {
+                rest: f
+                for rest, f in sums.items()
+                if (divided or set(divisors).issuperset(_divisors(rest)))
+                and not f.as_coeff_Mul()[1].is_Pow
+                and _coefficients(f)
+            }
+            if found:
+                kept = [term for rest, group in groups.items() for term, _ in group if rest not in found]
+                rests = {rest: _without_places(rest.xreplace({X: a}), divided) for rest in found}
+                return sp.Add(*kept, *(rests[rest] * removed(_Formula(f), a, 0) for rest, f in found.items()))
     return None
 
 
-def _ratio(a: sp.Expr, b: sp.Expr) -> sp.Expr | None:
-    """a/b, if that does not divide by what b holds."""
-    if not a.free_symbols & b.free_symbols:
-        return None
-    ratio = a / b
-    if ratio.free_symbols & b.free_symbols and ratio.is_rational_function():
-        ratio = sp.cancel(ratio)
-    return None if sp.fraction(ratio)[1].free_symbols & b.free_symbols else ratio
+def _substitutions(a: sp.Expr, symbols: set[sp.Symbol]) -> list[dict[sp.Expr, sp.Expr]]:
+    """Replacements by which a is x: of one of the symbols, in which it is linear, or of itself."""
+    slopes = {s: a.diff(s) for s in ordered(a.free_symbols & symbols)}
+    linear = [{s: sp.expand((X - a) / c) + s} for s, c in slopes.items() if s not in c.free_symbols]
+    return linear or [{a: X}] * bool(slopes)

@@ -55,7 +55,7 @@ from sympflow.hamiltonian.jumps import (
 )
 from sympflow.hamiltonian.poles import Poles, SymbolicPoles
 from sympflow.hamiltonian.recorded import recorded
-from sympflow.hamiltonian.removable import BOUNDED, Max, sinc
+from sympflow.hamiltonian.removable import BOUNDED, Max, removed
 from sympflow.show.cards import cut
 
 LARGEST, TINY = sys.float_info.max, 1e-150
@@ -848,8 +848,8 @@ def _with_numeric_constants(H: sp.Expr) -> sp.Expr:
 
 
 def printable(f: sp.Expr) -> sp.Expr:
-    """A derivative as code needs it: constants as numbers, sinc written out, the δ of a kink's second one left out."""
-    f = without_deltas(f).replace(sinc, lambda *args: sinc(*args).written_out)
+    """A derivative as code needs it: numbers, series written out, the δ of a kink's second one left out."""
+    f = without_deltas(f).replace(removed, lambda *args: removed(*args).written_out)
     if f.has(Max) and f.has(sp.Heaviside):
         f = f.replace(lambda e: e.is_Mul and e.has(sp.Heaviside), _bounded_below)
     return _with_numeric_constants(f)

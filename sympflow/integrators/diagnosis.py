@@ -10,7 +10,6 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
-from weakref import WeakSet
 
 import numpy as np
 
@@ -53,9 +52,6 @@ FEW_STEPS = 20
 FINER, MOST_FINER = 4, 64  # fine steps for each step of a run that they judge, and the most between two outputs
 MOST_AGAIN = 100  # steps on a clock, which are made again in halves
 SAFE = 4  # steps of so many `dt` of a system are not looked at in a run of few
-FEWEST_NEAR, LOST_DIGITS = 100, 1e-9
-"""The closest of so many steps, or of all, to a value where terms cancel is that part of the way from it; a force with
-that share of errors there is told."""
 STRAIGHT = 1 - 1e-9  # of the squared cosine of velocity and acceleration, of a motion that may lead to a centre
 NUDGE = 1e-9  # of the momenta, by which forces change them to show the way of what is at rest
 TURNING = Failure.CLOCK, Failure.ENCOUNTER  # breakdowns of methods that turn at an exact collision
@@ -63,22 +59,18 @@ NO_FORCE = (
     "At the last state the force is NaN: write H without parts that overflow, such as exp(800), or are 0/0; shorter "
     "steps do not help. Start elsewhere"
 )
-_TOLD: WeakSet[Any] = WeakSet()
 
 
 def diagnose_piece(outcome: Outcome, integrator: Integrator, problem: Problem, rows: ParameterRows | None) -> bool:
-    """Note poles that a run passed, if any, digits that it lost, and when the solution of one that failed ends."""
+    """Note poles that a run passed, if any, and when the solution of one that failed ends."""
     system, failed = problem.system, _failed(outcome)
     looked = system.definition.poles is not None or problem.parameter_values is not None
     if not problem.diagnosed or not (failed or looked) or not readable(outcome.y):
         return False
     found: list[Passage] = []
     plain = problem.parameter_values is None
-    if problem.store is None and looked:
-        if not failed or np.any(np.asarray(outcome.status) >= 0):
-            found = note_poles(outcome, integrator, problem, rows)
-        if plain:
-            warn_of_cancelling(outcome, problem)
+    if problem.store is None and looked and (not failed or np.any(np.asarray(outcome.status) >= 0)):
+        found = note_poles(outcome, integrator, problem, rows)
     passed = any(each.certain for each in found)
     if plain and (failed or passed):
         note_singularities(outcome, integrator, problem, passed)
@@ -137,7 +129,7 @@ def note_poles(
     numbers: Sequence[Any] = ()
     if problem.parameter_values is not None:
         poles, numbers = problem.system.symbols.parametric.poles, [*problem.parameter_values]
-    if poles is None or not poles.watched or not n:
+    if not poles or not n:
         return []
     starts = to_numpy(problem.y0).reshape(-1, width)
     outputs = to_numpy(outcome.y).reshape(n, -1, width)
@@ -150,7 +142,7 @@ def note_poles(
         try:
             looked = _look(problem.system, poles.look(y, t[:, None], numbers))
             if looked is not None and (exact := poles.exact) is not poles:
-                looked = _look(problem.system, exact.look(y, t[:, None])) if exact and exact.watched else None
+                looked = _look(problem.system, exact.look(y, t[:, None])) if exact else None
         except TypeError:  # a function that takes no arrays
             return []
         if looked is None:
@@ -169,7 +161,7 @@ def note_poles(
                 else replace(problem, system=values.system_of(row), parameter_values=None)
             )
             known = own.system.definition.poles and own.system.definition.poles.exact
-            if known is None or not known.watched:
+            if not known:
                 continue
             ends = t[-1], t[int(np.argmax(odd[:, row]))]
             passage = _passage(known, *_steps_of(outcome, integrator, own, row, ends), scale[row])
@@ -195,7 +187,7 @@ def warn_of_collision(outcome: Outcome, integrator: Integrator, problem: Problem
     system, poles = problem.system, problem.system.definition.poles
     if not isinstance(integrator, FixedStep) or integrator.breakdown not in TURNING or not len(outcome.t):
         return False
-    if poles is None or not poles.watched:
+    if not poles:
         return False
     d, y0 = system.ndof, to_numpy(problem.y0).reshape(-1, 2 * system.ndof)[:MOST_NAMED].astype(float)
     with np.errstate(all="ignore"):
@@ -221,34 +213,6 @@ def warn_of_collision(outcome: Outcome, integrator: Integrator, problem: Problem
             RuntimeWarning,
         )
     return bool(len(met))
-
-
-def warn_of_cancelling(outcome: Outcome, problem: Problem) -> None:
-    """Warn, once for a system, of a run about a value of q or p near which terms of H cancel until digits are lost."""
-    poles, width, n = problem.system.definition.poles, 2 * problem.system.ndof, len(outcome.t)
-    if poles is None or not poles.cancelling or poles in _TOLD:
-        return
-    starts = to_numpy(problem.y0).reshape(-1, width)
-    every = slice(None, None, max(1, n // LOOKED_AT))
-    y = np.concatenate([starts[None], to_numpy(outcome.y).reshape(n, len(starts), width)[every]])
-    steps = max(FEWEST_NEAR, int(outcome.stats.get("n_steps", 0)) // (1 if problem.y0.ndim == 1 else len(starts)))
-    for each in poles.cancelling:
-        x = poles.visited(each, y).reshape(len(y), -1) - each.at
-        about = (np.fmin.reduce(x) <= 0) & (np.fmax.reduce(x) >= 0)
-        if about.any():
-            x = x[:, about]
-        sizes = np.abs(x)
-        near = float(np.fmax.reduce(sizes, axis=None) / steps if about.any() else np.fmin.reduce(sizes, axis=None))
-        if near > 0 and x[0].all() and not each.loss(near, x.ravel() + each.at) > LOST_DIGITS:
-            continue
-        _TOLD.add(poles)
-        warn(
-            f"`system` has terms that cancel {each.name}: near it many digits of the force are wrong in this run, and "
-            "at it the force is not finite. Write them by sinc, which is sin(x)/x without that, or near it by their "
-            "series, in a Piecewise.",
-            RuntimeWarning,
-        )
-        return
 
 
 def _look(

@@ -24,7 +24,7 @@ from sympflow.flow.flow_map import FlowMap
 from sympflow.hamiltonian.domain import Box, Domain, EnergySublevel
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.learning.diagnosis import Reading, best_by_increments, hint
-from sympflow.learning.fitting import STEP_ERROR, limit_of, noise_of
+from sympflow.learning.fitting import FORGOTTEN, LAG, SMOOTHED, STEP_ERROR, correlation_of, limit_of, noise_of
 from sympflow.learning.library import Library, library_for
 from sympflow.learning.orbits import Method
 from sympflow.learning.shooting import Fit, Problem, chosen_method, minimized
@@ -369,10 +369,11 @@ def discover(
     most_terms = checked_count("most_terms", plain(most_terms), 1, sys.maxsize, "an integer, 1 or more")
     seed = checked_count("seed", plain(seed), 0, sys.maxsize, "an integer, 0 or more")
     huber = limit_of(loss)
-    search = _Search(trajectories, terms, degree, noise, held_out, piece, huber, most_terms, seed, session)
+    options = terms, degree, noise, held_out, piece, huber, most_terms, seed
     with session.interruption, session.bar(None, "Models") as bar:
         models = itertools.count(1)
-        search.say = progress if callable(progress) else lambda line: bar.tries(next(models), cut(line))
+        say = progress if callable(progress) else lambda line: bar.tries(next(models), cut(line))
+        search = _Search(trajectories, *options, session, say)
         discovery = search.run()
     box = np.array([trajectories.states.min(0), trajectories.states.max(0)])
     first = max(trajectories.runs, key=lambda run: run.span)
@@ -409,11 +410,11 @@ class _Search:
         most_terms: int,
         seed: int,
         session: Session,
+        say: Callable[[str], None],
     ) -> None:
-        self.session, self.over = session, session.deadline.over
+        self.session, self.over, self.say = session, session.deadline.over, say
         self.doubt: Reading | None = None
         self.tube: Domain | None = None
-        self.say: Callable[[str], None] = lambda _: None
         self.data, self.most_terms, self.huber = data, most_terms, huber
         self.known = noise_of(noise, data.ndof)
         n = len(data.runs)
@@ -722,7 +723,7 @@ class _Search:
         explains &= bool((noise < 0.5 * self.data.scales).all())
         same = self._unseen(chosen, fit) if explains else ()
         explains &= not same
-        remark = remark_on(same) if same else self._too_loud(noise) if explains else self._remark(noise, excess)
+        remark = remark_on(same) if same else self._too_loud(noise) if explains else self._remark(fit, noise, excess)
         if self.session.cut:
             remark = f"{remark} The time budget, or Ctrl-C, ended the search: give it more.".strip()
         found = Discovery(
@@ -788,13 +789,21 @@ class _Search:
             "that out, or give what is left, `discovery.noise`; small terms may be missing."
         )
 
-    def _remark(self, noise: np.ndarray, excess: np.ndarray) -> str:
+    def _remark(self, fit: Fit, noise: np.ndarray, excess: np.ndarray) -> str:
         worst = int(np.argmax(excess))
         otherwise = "Give other `terms`, a higher `degree`, or the `noise` if it is larger than it looks."
         if self.known is not None and noise[worst] < LOUD * self.smooth.sigma[worst]:
             otherwise = (
                 f"But without any model the data show noise of up to {self.smooth.sigma[worst]:.2g} there: leave "
                 "`noise` out, or give that."
+            )
+        runs, lag = fit.problem.data.runs, LAG / self.rate
+        near, later = (correlation_of(runs, fit.residuals, noise, after)[0] for after in (0.0, lag))
+        if near > SMOOTHED and abs(later) < FORGOTTEN:
+            otherwise = (
+                f"What it leaves is alike from one point to the next, by a correlation of {near:.2f}, and forgotten "
+                f"{lag:.2g} later, as noise of data that were smoothed: give the data as they were measured, or what "
+                "is left as `noise`."
             )
         found = hint(self.library, self.smooth, self.data)
         if found is None and self.doubt is not None:

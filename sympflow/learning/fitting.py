@@ -307,8 +307,8 @@ def judged(found: Fitted, held: Trajectories, setting: Setting) -> Held:
     exact = bool(all((np.abs(r)[np.isfinite(r)] < 100 * EXACT * scales.max()).all() for r in residuals))
     limits = None if setting.huber is None else setting.huber * sigma[:, None]
     residuals = [left if limits is None else np.clip(left, -limits, limits) for left in residuals]
-    near, beside = _correlation(pieces.runs, residuals, sigma, 0.0)
-    far, pairs = _correlation(pieces.runs, residuals, sigma, setting.lag)
+    near, beside = correlation_of(pieces.runs, residuals, sigma, 0.0)
+    far, pairs = correlation_of(pieces.runs, residuals, sigma, setting.lag)
     some = int(pairs * (1 - near) / (1 + near)) if near > SMOOTHED else 0
     lagged = setting.lag > held.time_scale and some >= FEWEST_PAIRS and abs(far) < FORGOTTEN
     correlation, pairs = (far, some) if lagged else (near, beside)
@@ -321,7 +321,7 @@ def judged(found: Fitted, held: Trajectories, setting: Setting) -> Held:
     return Held(pieces.runs, tuple(residuals), losses, values, correlation, pairs, exact, loudness, excess, lag)
 
 
-def _correlation(
+def correlation_of(
     runs: Sequence[Run], residuals: Sequence[np.ndarray], sigma: np.ndarray, lag: float
 ) -> tuple[float, int]:
     """The correlation of residuals with those a lag later, the next at least, NaN without any; and their number."""

@@ -218,12 +218,10 @@ def _of_file(path: Path) -> Any:
     ending = path.suffix.lower()
     if ending in (".csv", ".tsv", ".txt"):
         pandas = imported("pandas", "Reading a table")
-        if ending == ".csv":
-            _check_commas(path)
-        sep = None if ending == ".txt" else "\t" if ending == ".tsv" else ","
+        separators = _separators(path) if ending == ".csv" else {"sep": None if ending == ".txt" else "\t"}
         with warnings.catch_warnings():  # of another engine for separators that are found
             warnings.simplefilter("ignore")
-            options = {"sep": sep, "comment": "#", **_header(path)}
+            options = {**separators, "comment": "#", **_header(path)}
             if "names" not in options:  # else pandas gives the second of two columns of one name another
                 first = pandas.read_csv(path, **options, header=None, nrows=1, dtype=str)
                 _check_different(first.iloc[0].dropna().str.strip().tolist() if len(first) else [])
@@ -287,15 +285,12 @@ def _loaded(data: Any) -> Any:
     return data.load()
 
 
-def _check_commas(path: Path) -> None:
-    """Refuse a CSV file whose columns are separated by semicolons, as where numbers have decimal commas."""
+def _separators(path: Path) -> dict[str, str]:
+    """Options of pandas for a CSV file; semicolons separate columns where numbers have decimal commas."""
     with path.open(encoding="utf-8", errors="replace") as file:
         names = next((line for line in file if line.strip() and not line.startswith("#")), "")
-    if ";" in names and "," not in names:
-        raise ValueError(
-            f"`data` names the file {str(path)!r}, whose columns are separated by semicolons: write it with commas, "
-            "and points in numbers, or give the table of pandas.read_csv(path, sep=';', decimal=',')."
-        )
+        decimal = "," if any("," in line for line in file) else "."
+        return {"sep": ";", "decimal": decimal} if ";" in names else {"sep": ","}
 
 
 def of_table(

@@ -35,7 +35,7 @@ from sympflow.learning.trajectories import Trajectories
 from sympflow.learning.unseen import remark_on, tube, unseen
 from sympflow.training import checkpoint as checkpoints
 from sympflow.training.least_squares import never
-from sympflow.training.session import Path, Session, Silent
+from sympflow.training.session import Deadline, Path, Session, Silent
 from sympflow.training.starts import step_of
 from sympflow.training.trainer import train
 
@@ -430,10 +430,9 @@ class Search:
             return
         deadline = session.deadline
         if not math.isfinite(held.loudness):
-            found = None if deadline.over() else self._hint()
             warn(
                 f"The time budget ended before the best model, {candidate.name}, was compared with held-out "
-                f"trajectories: give it more. {found or ''}".strip()
+                f"trajectories: give it more. {self._hint(deadline) or ''}".strip()
             )
             return
         said = (
@@ -455,11 +454,12 @@ class Search:
         otherwise = "Give more trajectories, say what is known of H, or give the `noise` if it is larger than it looks."
         if self.cut:
             otherwise = f"The time budget ended the search: give it more. {otherwise}"
-        reason = None if deadline.over() else self._hint()
-        warn(f"{said} {reason or otherwise}")
+        warn(f"{said} {self._hint(deadline) or otherwise}")
 
-    def _hint(self) -> str | None:
-        """The likeliest reason why the best model does not explain the data, by slopes."""
+    def _hint(self, deadline: Deadline) -> str | None:
+        """The likeliest reason why the best model does not explain the data, by slopes, if there is time to look."""
+        if deadline.over():
+            return None
         smooth = self._whole(self.data).smooth
         library = library_for(None, self.data.ndof, 4, smooth.points)[0]
         drives = [self.constraints.driven(w) for w in self.best[0].model.frequencies(self.best[1].theta)]
