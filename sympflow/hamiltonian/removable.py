@@ -131,9 +131,8 @@ def _coefficients(f: sp.Expr) -> tuple[Any, ...]:
 
     They are Cauchy's integrals, and those of negative powers must vanish.
     """
-    exact = f.xreplace({a: sp.nsimplify(a, rational=True) for a in f.atoms(sp.Float)})
     with mpmath.workdps(DIGITS), suppress(ArithmeticError, ValueError, TypeError, NameError):
-        function = sp.lambdify(X, exact, [BOUNDED_VALUES, "mpmath"])
+        function = sp.lambdify(X, f, [BOUNDED_VALUES, "mpmath"])
         with suppress(ZeroDivisionError):
             if mpmath.isfinite(function(mpmath.mpf(0))):
                 return ()
@@ -450,13 +449,17 @@ def _without_places(f: Any, divided: bool = False) -> Any:
 
 def _finite(terms: Sequence[sp.Expr], divided: bool) -> sp.Expr | None:
     """The sum of terms, some of them by `removed`; None if there is none that is 0/0 or ∞ − ∞ somewhere, and finite."""
-    divisors = [b for term in terms for b in _divisors(term)]
-    arguments = [f.args[0] for term in terms for f in term.atoms(sp.Function) if isinstance(f.args[0], sp.Expr)]
-    for a in dict.fromkeys((*arguments, *divisors)):
+    exact = {term: _exact(term) for term in terms}
+    divisors = [b for term in exact.values() for b in _divisors(term)]
+    roots = [s for b in divisors if len(b.free_symbols) == 1 for s in b.free_symbols]
+    arguments = [
+        f.args[0] for term in exact.values() for f in term.atoms(sp.Function) if isinstance(f.args[0], sp.Expr)
+    ]
+    for a in dict.fromkeys((*arguments, *divisors, *roots)):
         for with_x in _substitutions(a, set().union(*(b.free_symbols for b in divisors))):
             groups: dict[sp.Expr, list[tuple[sp.Expr, sp.Expr]]] = {}
-            for term in terms:
-                changed = term.xreplace(with_x).replace(lambda e: e.is_Add and e.free_symbols > {X}, sp.expand)
+            for term, f in exact.items():
+                changed = f.xreplace(with_x).replace(lambda e: e.is_Add and e.free_symbols > {X}, sp.expand)
                 alone = [b for b in sp.Mul.make_args(changed) if b.free_symbols <= {X}]
                 rest = sp.Mul(*(b for b in sp.Mul.make_args(changed) if b not in alone))
                 groups.setdefault(rest, []).append((term, sp.Mul(*alone)))
@@ -464,7 +467,7 @@ def _finite(terms: Sequence[sp.Expr], divided: bool) -> sp.Expr | None:
             found = {
                 rest: f
                 for rest, f in sums.items()
-                if (divided or set(divisors).issuperset(_divisors(rest)))
+                if (divided or not any(b.free_symbols & a.free_symbols for b in _divisors(rest)))
                 and not f.as_coeff_Mul()[1].is_Pow
                 and _coefficients(f)
             }
@@ -473,6 +476,11 @@ def _finite(terms: Sequence[sp.Expr], divided: bool) -> sp.Expr | None:
                 rests = {rest: _without_places(rest.xreplace({X: a}), divided) for rest in found}
                 return sp.Add(*kept, *(rests[rest] * removed(_Formula(f), a, 0) for rest, f in found.items()))
     return None
+
+
+def _exact(f: sp.Expr) -> sp.Expr:
+    """An expression with fractions in place of decimal ones."""
+    return f.xreplace({a: sp.nsimplify(a, rational=True) for a in f.atoms(sp.Float)})
 
 
 def _substitutions(a: sp.Expr, symbols: set[sp.Symbol]) -> list[dict[sp.Expr, sp.Expr]]:
