@@ -20,11 +20,12 @@ from sympy.core.relational import Relational
 
 from sympflow.hamiltonian.definition import ASIDE
 from sympflow.hamiltonian.driving import JUMP, MOST_TURNS, Samples, sampled, with_symbols
-from sympflow.hamiltonian.removable import triangle
+from sympflow.hamiltonian.removable import X, cancelling, exact, removed, triangle, with_values
 
 MISMATCH = 1e-6
 """Share of the values on both sides of a border by which pieces that are joined may differ there: their constants are
 often written with seven figures."""
+GROWTH = 1e3  # from 1e-4 of a place to it, of what is infinite there and does not jump
 PERIOD_TOLERANCE = 1e-9  # share of itself by which a period may differ from a multiple of that of a term
 MOST_POINTS = 2**20  # times at which a function that is neither a polynomial nor periodic is looked at for its zeros
 MOST_IMPULSES = 1_000_000
@@ -190,6 +191,12 @@ def check_continuous(
     """Refuse an expression that jumps in some of its symbols, where a force would be infinite for no time at all."""
     states = set(states)
     refuse_deltas(argument, f, names)
+    numbers = {s: exact(float(v)) for s, v in (values or {}).items() if np.ndim(v) == 0}
+    if cancelling(f) != cancelling(with_values(f, numbers)):
+        raise ValueError(
+            f"`{argument}` has terms that cancel with the values that `params` gives, so that no digits are left near "
+            "the place where they do: write these values as numbers in it."
+        )
     [f], _ = with_symbols([f])
     for border in borders(f, states):
         try:
@@ -223,8 +230,10 @@ def _jump_in_states(
         ]
         jump, size = across(*tried)
         with np.errstate(all="ignore"):
-            slope = np.abs(across(*moved)[0] - jump) / np.where(at == 0, 1e-4, 1e-4 * np.abs(at))
-            seen = np.flatnonzero(np.isfinite(size) & (np.abs(jump) > MISMATCH * size + 4 * doubt * slope))
+            beside = across(*moved)[0]
+            slope = np.abs(beside - jump) / np.where(at == 0, 1e-4, 1e-4 * np.abs(at))
+            finite = np.isfinite(size) & (np.abs(jump) < GROWTH * np.abs(beside))
+            seen = np.flatnonzero(finite & (np.abs(jump) > MISMATCH * size + 4 * doubt * slope))
         if seen.size:
             i = seen[0]
             sides = [
@@ -456,6 +465,7 @@ class Touch:
 
 def touches(f: sp.Expr, time: sp.Symbol, samples: Mapping[str, Samples]) -> list[Touch]:
     """The functions of t alone that stand under a root in f, and may vanish without a change of sign."""
+    f = f.replace(removed, lambda *args: removed(*args).formula.xreplace({X: args[1]}))
     bases = [power.base for power in f.atoms(sp.Pow) if power.exp.is_integer is False]
     bases += [g for a in f.atoms(sp.asin, sp.acos) for g in (1 - a.args[0], 1 + a.args[0])]
     bases += [a.args[0] - 1 for a in f.atoms(sp.acosh)]

@@ -19,7 +19,8 @@ from sympflow.hamiltonian.jumps import check_continuous
 from sympflow.hamiltonian.linear_part import RestOfPotential, SpectralPart, Transform, dispersion, quadratic_terms
 from sympflow.hamiltonian.local import LocalHamiltonian, check_memory, checked_params, numbered, parsed
 from sympflow.hamiltonian.poles import LatticePoles, Poles
-from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, exact
+from sympflow.hamiltonian.removable import exact
+from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 
 Expressions = Callable[[], Sequence[sp.Expr]]
 """Expressions that are made when a function of them is generated, not in each call of it."""

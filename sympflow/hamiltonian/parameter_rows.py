@@ -14,8 +14,9 @@ import numpy as np
 import sympy as sp
 
 from sympflow.arrays import differentiable, expanded, transformed, without_torch
+from sympflow.hamiltonian.removable import exact
 from sympflow.hamiltonian.scales import size_of_terms
-from sympflow.hamiltonian.symbolic import exact, generate, printable
+from sympflow.hamiltonian.symbolic import generate, printable
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.lazy import lately_kept
 

@@ -330,8 +330,6 @@ def _split(g: sp.Expr, x: tuple[sp.Symbol, ...]) -> Iterator[Place]:
         yield Place(g, sp.floor(g.args[0] / sp.pi))
     elif isinstance(g, sp.cos):
         yield Place(g, sp.floor(g.args[0] / sp.pi + sp.Rational(1, 2)))
-    elif (touched := _touched(g)) is not None:
-        yield touched
     elif (
         len(g.free_symbols) <= FACTORED
         and g.is_rational_function(*g.free_symbols)
@@ -353,19 +351,6 @@ def _vanishes(g: sp.Expr, s: sp.Symbol) -> bool:
         return bool(g.subs(s, 0).is_zero)
     except ValueError:  # of Max and Min, with something infinite in them
         return False
-
-
-def _touched(g: sp.Expr) -> Place | None:
-    """The place of c ± c·cos(a), c ± c·sin(a) and c·cosh(a) − c, whose sign does not change where they vanish."""
-    constant, term = g.as_independent(*g.free_symbols, as_Add=True)
-    factor, wave = term.as_coeff_Mul()
-    if not constant.is_number or not isinstance(wave, sp.cos | sp.sin | sp.cosh) or abs(constant) != abs(factor):
-        return None
-    a, opposite = wave.args[0], constant / factor < 0
-    if isinstance(wave, sp.cosh):
-        return Place(g, sp.sign(a)) if opposite else None
-    shift = {sp.cos: (sp.pi, 0), sp.sin: (sp.pi / 2, -sp.pi / 2)}[wave.func][bool(opposite)]
-    return Place(g, sp.floor((a + shift) / (2 * sp.pi)))
 
 
 def _of_polynomial(g: sp.Expr, x: tuple[sp.Symbol, ...]) -> Iterator[Place]:

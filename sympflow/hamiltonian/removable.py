@@ -4,7 +4,7 @@ integrals with derivatives at 0, and quotients of exponentials that do not overf
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import lru_cache
 from typing import Any
@@ -17,6 +17,7 @@ from sympy.printing.precedence import PRECEDENCE
 
 X = sp.Symbol("x", real=True)
 DIGITS, SAMPLES, LOWEST, COEFFICIENTS = 60, 192, 16, 48  # digits, values and powers, that give a series
+BESIDE = 300  # digits of values beside a place, which are left where parts of them cancel
 CIRCLES = 1.0, 0.25, 2.0**-4, 2.0**-7, 2.0**-10  # radii on which a function is sampled
 ALIKE = 1e-8  # relative difference, at most, of values beside a place where the function is finite
 NOISE, VANISHING = 1e-50, 1e-20  # of coefficients of a series: of rounding, and of powers that it should not have
@@ -94,7 +95,7 @@ class removed(sp.Function):
         """The same in functions that code has, each branch finite wherever it is evaluated."""
         formula, a, n = self.args
         radius, series = _series(formula.f, int(n))
-        near, far = Max(Min(a, radius), -radius), a + 2 * radius * Max(sp.sign(radius - sp.Abs(a)), 0)
+        near, far = Max(Min(a, radius), -radius), a + (radius - a) * Max(sp.sign(radius - sp.Abs(a)), 0)
         return sp.Piecewise((series.xreplace({X: near}), sp.Abs(a) < radius), (self.formula.xreplace({X: far}), True))
 
     def _code(self, printer: Any) -> str:
@@ -136,7 +137,8 @@ def _coefficients(f: sp.Expr) -> tuple[Any, ...]:
         with suppress(ZeroDivisionError):
             if mpmath.isfinite(function(mpmath.mpf(0))):
                 return ()
-        beside = [function(mpmath.mpf(x)) for x in (1e-20, -1e-20, 1e-10)]
+        with mpmath.workdps(BESIDE):
+            beside = [function(mpmath.mpf(x)) for x in (1e-20, -1e-20, 1e-10)]
         size = max(map(abs, beside))
         if not all(mpmath.isfinite(y) and abs(y - beside[0]) <= ALIKE * (size + 1) for y in beside):
             return ()
@@ -303,7 +305,91 @@ def with_own_functions(f: sp.Expr) -> sp.Expr:
                 f = f.replace(arc(wave(x)), sp.pi / 4 * (1 - sign) + sign * triangle(x + shift))
     f = f.replace(sp.elliptic_k, elliptic_k).replace(sp.elliptic_e, elliptic_e)
     f = _without_overflow(_with_extrema(f.replace(sp.sinc, lambda x: sp.sin(x) / x)))
-    return _without_places(_without_places(f), divided=True)
+    f = f.replace(lambda e: _is_root(e) or isinstance(e, sp.log), lambda e: e.func(_square(e.args[0]), *e.args[1:]))
+    f = _without_places(_without_places(f), divided=True)
+    return f.replace(lambda e: _is_root(e) and e.exp.is_number and float(2 * e.exp) % 2 == 1, _root)
+
+
+# what vanishes as a square --------------------------------------------------------------------------------------------
+
+
+def _is_root(f: sp.Expr) -> bool:
+    return f.is_Pow and f.base.is_Add and (f.exp.is_integer is False or f.exp.could_extract_minus_sign())
+
+
+_SQUARES: tuple[tuple[Callable[[Any], sp.Expr], int, Callable[[Any], sp.Expr]], ...] = (
+    (sp.cos, 1, lambda a: -2 * sp.sin(a / 2) ** 2),
+    (sp.cos, -1, lambda a: 2 * sp.cos(a / 2) ** 2),
+    (sp.sin, 1, lambda a: -2 * sp.sin(a / 2 - sp.pi / 4) ** 2),
+    (sp.sin, -1, lambda a: 2 * sp.cos(a / 2 - sp.pi / 4) ** 2),
+    (sp.cosh, 1, lambda a: 2 * sp.sinh(a / 2) ** 2),
+    (lambda a: sp.cos(a) ** 2, 1, lambda a: -(sp.sin(a) ** 2)),
+    (lambda a: sp.sin(a) ** 2, 1, lambda a: -(sp.cos(a) ** 2)),
+    (lambda a: sp.cosh(a) ** 2, 1, lambda a: sp.sinh(a) ** 2),
+)
+"""Functions f(a), numbers c that they touch, and f(a) − c as a product."""
+
+
+def _square(f: sp.Expr) -> sp.Expr:
+    """A sum c (f(a) − f₀) as a product, where f touches f₀, as 1 − cos a; any other as it is."""
+    if not f.is_Add:
+        return f
+    f = f.replace(lambda e: e.is_Add, _hyperbolic)
+    constant, term = f.as_independent(*(wave for wave in f.atoms(sp.Function)), as_Add=True)
+    for wave, touched, product in _SQUARES:
+        for a in {each.args[0] for each in term.atoms(sp.Function)}:
+            factor = term / wave(a)
+            if not factor.has(sp.Function) and sp.expand(constant + touched * factor) == 0:
+                return factor * product(a)
+    return f
+
+
+def _hyperbolic(f: sp.Add) -> sp.Expr:
+    """A sum in which c eᵃ + c e⁻ᵃ is 2c cosh a."""
+    for wave in f.atoms(sp.exp):
+        a = wave.args[0]
+        up, down = f.coeff(sp.exp(a)), f.coeff(sp.exp(-a))
+        if up != 0 and up == down:
+            return f + up * (2 * sp.cosh(a) - sp.exp(a) - sp.exp(-a))
+    return f
+
+
+def _root(f: sp.Pow) -> sp.Expr:
+    """A root; of what vanishes as the square of a does with |a| before it, as |a| √((eᵃ − 1 − a)/a²)."""
+    base, n = f.args
+    if not base.has(sp.Function) and all(power.exp.is_Integer for power in base.atoms(sp.Pow)):
+        return f
+    arguments = [wave.args[0] for wave in base.atoms(sp.Function)]
+    for a in dict.fromkeys((*arguments, *sorted(base.free_symbols, key=str))):
+        if isinstance(a, sp.Expr) and (found := _finite([base / a**2], divided=False)) is not None:
+            return sp.Abs(a) ** (2 * n) * found**n
+    return f
+
+
+def with_values(f: sp.Expr, values: Mapping[sp.Symbol, Any]) -> Any:
+    """An expression with values of parameters, by which parts of it may cancel."""
+    found = f.xreplace(values)
+    return with_own_functions(found) if may_cancel(f, set(values)) else found
+
+
+def cancelling(f: sp.Expr) -> tuple[int, int]:
+    """The numbers of places where parts of f cancel: of those written by series, and of roots of sums."""
+    return len(f.atoms(removed)), sum(_is_root(e) and e.exp.is_integer is False for e in f.atoms(sp.Pow))
+
+
+def may_cancel(f: sp.Expr, parameters: set[sp.Symbol]) -> bool:
+    """Return True if parts of f may cancel by the values of parameters where they are infinite, or under a root."""
+    if not f.free_symbols & parameters:
+        return False
+    places = [e for e in sp.Add.make_args(f) if _divisors(e)]
+    sums = [e for e in f.atoms(sp.Add) if e != f and e.has(sp.Function) and e.free_symbols & parameters]
+    roots = any(_is_root(e) and e.exp.is_integer is False for e in f.atoms(sp.Pow))
+    return _unlike(places) or (bool(sums) and (roots or bool(places)))
+
+
+def exact(value: float) -> sp.Expr:
+    """The number as it stands in an expression: integers as such."""
+    return sp.nsimplify(value) if float(value).is_integer() else sp.Float(value)
 
 
 # quotients of exponentials --------------------------------------------------------------------------------------------
@@ -422,13 +508,19 @@ def _with_extrema(f: sp.Basic) -> Any:
 # what is infinite at a place in parts alone ---------------------------------------------------------------------------
 
 
-_INFINITE = sp.csch, sp.coth, sp.csc, sp.cot, bose
+_INFINITE = sp.csch, sp.coth, sp.csc, sp.cot, sp.log, bose
 
 
 def _divisors(f: sp.Expr) -> list[sp.Expr]:
     """Expressions where f, or a part of it, is infinite if they vanish."""
     powers = [a.base for a in f.atoms(sp.Pow) if a.exp.is_number and a.exp.is_negative]
     return [a for a in (*powers, *(a.args[0] for a in f.atoms(*_INFINITE))) if a.free_symbols]
+
+
+def _unlike(terms: Sequence[sp.Expr]) -> bool:
+    """True if terms that are infinite somewhere are not powers of one divisor alone, which do not cancel."""
+    apart = len({a for term in terms for a in _divisors(term)}) > 1
+    return len(terms) > 1 and (apart or any(term.has(sp.Function) for term in terms))
 
 
 def _without_places(f: Any, divided: bool = False) -> Any:
@@ -442,7 +534,7 @@ def _without_places(f: Any, divided: bool = False) -> Any:
         return _finite([f], divided) or f.func(*(_without_places(x, divided) for x in f.args))
     f = f.func(*(_without_places(x, divided) for x in f.args))
     infinite = [term for term in f.args if _divisors(term)] if f.is_Add else []
-    if 1 < len(infinite) <= MOST_TERMS and (found := _finite(infinite, divided)) is not None:
+    if len(infinite) <= MOST_TERMS and _unlike(infinite) and (found := _finite(infinite, divided)) is not None:
         return found + sp.Add(*(term for term in f.args if term not in infinite))
     return f
 
@@ -480,7 +572,7 @@ def _finite(terms: Sequence[sp.Expr], divided: bool) -> sp.Expr | None:
 
 def _exact(f: sp.Expr) -> sp.Expr:
     """An expression with fractions in place of decimal ones."""
-    return f.xreplace({a: sp.nsimplify(a, rational=True) for a in f.atoms(sp.Float)})
+    return f.xreplace({a: sp.Rational(repr(float(a))) for a in f.atoms(sp.Float)})
 
 
 def _substitutions(a: sp.Expr, symbols: set[sp.Symbol]) -> list[dict[sp.Expr, sp.Expr]]:

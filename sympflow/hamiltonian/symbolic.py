@@ -55,7 +55,7 @@ from sympflow.hamiltonian.jumps import (
 )
 from sympflow.hamiltonian.poles import Poles, SymbolicPoles
 from sympflow.hamiltonian.recorded import recorded
-from sympflow.hamiltonian.removable import BOUNDED, Max, removed
+from sympflow.hamiltonian.removable import BOUNDED, Max, cancelling, exact, may_cancel, removed, with_values
 from sympflow.show.cards import cut
 
 LARGEST, TINY = sys.float_info.max, 1e-150
@@ -210,6 +210,7 @@ class SymbolicHamiltonian(Definition):
             used == {*form.parameters}
             and form.separable == self.separable
             and (form.inverse_mass is None) == (self.inverse_mass is None)
+            and cancelling(form.H) == cancelling(self.H)
         )
         return form if kept and alike and all(map(math.isfinite, form.values)) else self
 
@@ -242,7 +243,7 @@ class SymbolicHamiltonian(Definition):
         None where H may have another structure with these, which is then to be found anew.
         """
         form, (written, before) = self.parametric, self.written
-        if form is self or self.time is not None or self.impulses:
+        if form is self or self.time is not None or self.impulses or form.may_cancel:
             return None
         values = {s: exact(params[s.name]) for s in before}
         parts, replaced = self.parametric_parts
@@ -257,6 +258,11 @@ class SymbolicHamiltonian(Definition):
         if any(not math.isfinite(x) or x in (0, 1, -1) for x in numbers):
             return None
         return Revalued(self, form, written, values, numbers)
+
+    @cached_property
+    def may_cancel(self) -> bool:
+        """True if parts of H may cancel by the values of its `parameters`."""
+        return may_cancel(self.H, {*self.parameters})
 
     @property
     def written(self) -> tuple[sp.Expr, dict[sp.Symbol, sp.Expr]]:
@@ -699,15 +705,9 @@ def _read(
     }
 
 
-def exact(value: float) -> sp.Expr:
-    """The number as it stands in an expression: integers as such."""
-    return sp.nsimplify(value) if float(value).is_integer() else sp.Float(value)
-
-
 def _valued(H: sp.Expr, values: Mapping[sp.Symbol, sp.Expr], time: sp.Symbol | None) -> sp.Expr:
     """The expression, its parameters replaced by their values."""
-    for symbol, value in values.items():
-        H = H.xreplace({symbol: value})
+    H = with_values(H, values)
     unknown = sorted(s.name for s in H.free_symbols if not _is_coordinate(s.name) and s != time)
     if functions := sorted(map(str, H.atoms(AppliedUndef))):
         raise TypeError(

@@ -87,7 +87,7 @@ def time_transformed(
     if symbols is not None:
         import sympy as sp
 
-        from sympflow.hamiltonian.symbolic import exact
+        from sympflow.hamiltonian.removable import exact
 
         H = sp.log(symbols.T + sp.Symbol(f"p{symbols.ndof + 1}", real=True)) - sp.log(exact(c) - symbols.V)
         transformed = HamiltonianSystem.from_sympy(H, name=name, energy_scale=1.0)

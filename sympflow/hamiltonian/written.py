@@ -21,7 +21,7 @@ from sympflow.hamiltonian.grammar import COORDINATE, chain, parsed
 
 FUNCTIONS = {name: name for name in ("sqrt", "exp", "log", "sin", "cos", "tan", "sinh", "cosh", "tanh", "atan")}
 FUNCTIONS["ln"] = "log"
-GROWING = {"exp", "sinh", "cosh"}
+ARITHMETIC = {"input", "add", "sub", "mul", "div", "neg", "pow", "times", "fma"}
 MOST_DEGREES, MOST_OPERATIONS = 16, 100  # of the slopes of H, written out
 MOST_POWER, MOST_BITS = 64, 2000
 
@@ -64,6 +64,8 @@ class _Reader:
         moving = [x for x in members if isinstance(x, Traced)]
         if not moving:
             return sum(numbers)
+        if sum(x.order in self.infinite for x in moving) > 1:  # a difference may have a finite limit
+            raise NotPlain
         total = self._marked(sum(moving[1:], moving[0]), moving)
         return total + float(sum(numbers)) if numbers else total
 
@@ -88,8 +90,8 @@ class _Reader:
             raise NotPlain
         if not whole and base.name not in ("input", "add", "sub"):  # as √x², which is |x|
             raise NotPlain
-        if exponent < 0 and GROWING & {x.name for x in reached([base])}:  # may overflow
-            raise NotPlain
+        if not (whole and exponent > 0) and not ARITHMETIC.issuperset(x.name for x in reached([base])):
+            raise NotPlain  # functions may overflow, or cancel, as 1 − cos x
         x = apply("pow", base.args[0], -0.5) if base.name == "sqrt" else apply("pow", base, float(exponent))
         return self._marked(x, [base], exponent < 0)
 
@@ -99,9 +101,9 @@ class _Reader:
         if name == "sqrt":
             return self._power(x, Fraction(1, 2))
         known = {each.name for each in reached([x])}
-        if x.order in self.infinite or (name == "log" and known & GROWING) or (name == "exp" and "log" in known):
+        if x.order in self.infinite or (name == "log" and known - ARITHMETIC) or (name == "exp" and "log" in known):
             raise NotPlain
-        return apply(name, x)
+        return self._marked(apply(name, x), [x], name == "log")
 
     def _marked(self, x: Any, made_of: Sequence[Traced], infinite: bool = False) -> Any:
         if not isinstance(x, Traced):  # terms that cancel

@@ -172,7 +172,12 @@ REMOVABLE = [
     *("sin(q)**2/q**2", "tan(q)/q", "tanh(q)/q", "atan(k*q)/q", "erf(q)/q", "q*csch(q)", "q/(exp(q) - 1)", "q*cot(q)"),
     *("log(1 + q)/q", "(exp(q) - 1 - q)/q**2", "k*(exp(k*q) - 1 - k*q)/q**2", "(q - sin(q))/q**3", "besselj(1, q)/q"),
     *("1/q - csch(q)", "csch(q)**2 - 1/q**2", "k*csch(k*q) - 1/q", "exp(-q**2)*sinh(q)/q", "sqrt(tanh(q)/q)"),
-    *("(sqrt(1 + q) - 1)/q", "sin(pi*(q + 1))/q", "(q**2 - q)/(q - q**3)"),
+    *("(sqrt(1 + q) - 1)/q", "sin(pi*(q + 1))/q", "(q**2 - q)/(q - q**3)", "1/q - 1/(q + q**2)", "1/q - 1/sin(q)"),
+    *(
+        "1/sin(q) - 1/tan(q)",
+        "log(q) - log(sin(q))",
+        "log(exp(q) - 1) - log(q)",
+    ),
 ]
 """V that is 0/0 or ∞ − ∞ at 0, in parts, and smooth there."""
 
@@ -198,6 +203,50 @@ def test_what_is_finite_though_its_parts_are_not_is_right_near_that_place(V, q):
         tensor = torch.tensor(y, requires_grad=True)
         (gradient,) = torch.autograd.grad(system.hamiltonian(tensor).sum(), tensor)
         np.testing.assert_allclose(gradient.numpy(), system.gradient(y), rtol=1e-13, atol=1e-16)
+
+
+ROOTS = {
+    "sqrt(exp(q) + exp(-q) - 2)": lambda x: 2 * mpmath.sinh(x / 2),
+    "sqrt(k*exp(2*q) + k*exp(-2*q) - 2*k)": lambda x: 2 * mpmath.sqrt(mpmath.mpf(1.3)) * mpmath.sinh(x),
+    "sqrt(1 - cos(2*q))": lambda x: mpmath.sqrt(2) * mpmath.sin(x),
+    "(k - k*cos(q))**1.5": lambda x: mpmath.sqrt(mpmath.mpf(1.3) * 2) ** 3 * mpmath.sin(x / 2) ** 3,
+    "1/sqrt(1 - cos(q)**2)": mpmath.csc,
+    "log(cosh(q) - 1)/2": lambda x: mpmath.log(mpmath.sqrt(2) * mpmath.sinh(x / 2)),
+    "sqrt(1 + sin(q - pi/2))": lambda x: mpmath.sqrt(2) * mpmath.sin(x / 2),
+    "sqrt(1 - sqrt(1 - q**2))": lambda x: x / mpmath.sqrt(1 + mpmath.sqrt(1 - x**2)),
+    "sqrt(exp(q) - 1 - q)": lambda x: mpmath.sqrt(mpmath.expm1(x) - x),
+}
+"""V by roots and logarithms of sums that touch 0 at q = 0, and the same for q > 0."""
+
+
+@pytest.mark.parametrize("q", [1e-9, 1e-5, 1e-3, 0.3])
+@pytest.mark.parametrize("V", ROOTS)
+def test_roots_of_what_touches_zero_keep_their_digits_there(V, q):
+    system = of_removable(V)
+    with mpmath.workdps(80):
+        value, slope = (float(mpmath.diff(ROOTS[V], mpmath.mpf(q), order)) for order in (0, 1))
+    np.testing.assert_allclose(system.potential(np.array([[q]])), value, rtol=2e-14)
+    np.testing.assert_allclose(-system.force(np.array([q]))[0], slope, rtol=2e-14)
+
+
+@pytest.mark.parametrize(("q", "rtol"), [(1e-9, 1e-14), (0.3, 1e-12)])
+@pytest.mark.parametrize("V", ["k*csch(q) - c/q", "(k*cosh(q) - c)/q", "k/q - c*cos(q)/q"])
+def test_terms_that_cancel_by_the_values_of_parameters_are_right_or_refused(V, q, rtol):
+    """V(q)/k is −q/6, q/2 or q/2 near 0: the slope beside 60 digits."""
+    with mpmath.workdps(60):
+        f = sp.lambdify(sp.Symbol("q"), sp.sympify(V, {"k": 1, "c": 1}), "mpmath")
+        slope = float(mpmath.diff(f, mpmath.mpf(q)))
+    H = f"p**2/2 + {V}"
+    system = HamiltonianSystem.from_sympy(H, params={"k": 2.5, "c": 1.5}, y0=[q, 0])
+    for k in (1.0, 2.5):
+        same = HamiltonianSystem.from_sympy(H, params={"k": k, "c": k})
+        np.testing.assert_allclose(-same.force(np.array([q]))[0], k * slope, rtol=rtol)
+        run = solve(system, "verlet", (0, 1e-9), dt=1e-9, params={"k": k, "c": k})
+        np.testing.assert_allclose(-run.p[0, -1] / 1e-9, k * slope, rtol=1e-6)
+        with pytest.raises(ValueError, match=r"^`bond` has terms that cancel .* write these values as numbers"):
+            HamiltonianSystem.lattice(shape=3, bond=V.replace("q", "r"), params={"k": k, "c": k})
+        with pytest.raises(ValueError, match=r"^`potential` has terms that cancel"):
+            HamiltonianSystem.pairs(V.replace("q", "r"), masses=[1, 1], dim=1, params={"k": k, "c": k})
 
 
 @pytest.mark.parametrize("r", [0.0, 1e-9, 1e-3, 0.3])

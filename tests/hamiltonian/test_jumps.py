@@ -47,6 +47,7 @@ KINKS = {
     "sqrt(1 - cos(2*t))": lambda s: math.sqrt(2) * np.abs(np.sin(s)),
     "t*(1 + sin(t))**1.5": lambda s: s * np.abs(math.sqrt(2) * np.cos(s / 2 - PI / 4)) ** 3,
     "exp(-sqrt(cosh(t - 2.03) - 1))": lambda s: np.exp(-math.sqrt(2) * np.abs(np.sinh((s - 2.03) / 2))),
+    "sqrt(1 - cos(t)**3)": lambda s: np.sqrt(2 + 2 * np.cos(s) + 2 * np.cos(s) ** 2) * np.abs(np.sin(s / 2)),
     "t*acos(0.5 + 0.5*cos(2*t))": lambda s: s * np.arccos(np.minimum(0.5 + 0.5 * np.cos(2 * s), 1)),
 }
 

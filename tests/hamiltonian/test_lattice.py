@@ -189,7 +189,7 @@ class TestPoles:
             ({"bond": "csch(1 + r)**2", "boundary": "free"}, 0.5, "r + 1 = 0 at the bond of 4 and 5"),
             ({"bond": "coth(2 + 2*r)", "boundary": "free"}, 0.5, "r + 1 = 0 at the bond of 4 and 5"),
             ({"bond": "atanh(r/2)/9"}, 0.5, "r - 2 = 0 at the bond of 3 and 4"),
-            ({"bond": "1/(1 - cos(r + 2))", "boundary": "free"}, 0.5, "1 - cos(r + 2) = 0 at the bond of 4 and 5"),
+            ({"bond": "1/(1 - cos(r + 2))", "boundary": "free"}, 0.5, "sin(r/2 + 1) = 0 at the bond of 4 and 5"),
             ({"bond": "1e-3/((r - 1)**2 - 1/4)"}, 0.5, "r - 1.5 = 0 at the bond of 3 and 4"),
         ],
     )
