@@ -148,6 +148,7 @@ class _Search:
     def run(self, t_span: tuple[float, float], rows: np.ndarray) -> Crossings:
         """Search all steps from `rows` (N, 2d)."""
         grid = Grid(*t_span, self.integrator.step_length(self.system))
+        self.stepper = self.integrator.stepper(Problem(self.system, *t_span, rows))
         y_end, to_go = rows, grid.t1 - grid.t0
         held: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
         for chunk in self.integrator.steps(self.system, t_span, rows):
@@ -206,7 +207,7 @@ class _Search:
         self.found.append((np.nonzero(crossed)[1], t + h * high, self._step(t, y, h * high)))
 
     def _step(self, t: np.ndarray, y: np.ndarray, h: np.ndarray) -> np.ndarray:
-        return self.integrator.step(self.system, t, y, h)  # type: ignore[arg-type]
+        return np.asarray(self.stepper.shorter(y, h, t))
 
     def _located(self, width: int, direction: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The crossings that were found, by trajectory and along the run."""
