@@ -226,11 +226,27 @@ class CollocatedFlowKernel(Kernel):
     def runs(self, task: Task) -> Run:
         m, carry = self._steps, task.carry
         inner = None if carry is None else RunCheckpoint(m * carry.steps, carry.running, carry.spare)
-        asked = task._replace(h=task.h / m, n_steps=m * task.n_steps, save=m * np.asarray(task.save), carry=inner)
+        asked = self._inner(task)._replace(carry=inner)
         states, n_finite, iterations = self._kernel.runs(asked)
         if carry is not None and inner is not None:
             carry.advance(task.n_steps, inner.running)
         return Run(states, n_finite // m, iterations)
+
+    def _inner(self, task: Task) -> Task:
+        """The steps of the Gauss method that a task asks for."""
+        m = self._steps
+        return task._replace(h=task.h / m, n_steps=m * task.n_steps, save=m * np.asarray(task.save))
+
+    def check_reverse(self) -> None:
+        self._kernel.check_reverse()
+
+    def recorded(self, task: Task) -> Between:
+        from sympflow.kernels.reverse import Between
+
+        run = self._kernel.recorded(self._inner(task._replace(save=task.save[begun_in(task.save) :])))
+        found = Between(task, run, run.states, lambda x: x, lambda x: x)
+        found.n_finite //= self._steps
+        return found
 
     def step(self, h: ArrayLike, y: np.ndarray, t: ArrayLike = 0.0) -> Steps:
         share, iterations = np.asarray(h, dtype=np.float64) / self._steps, 0

@@ -30,6 +30,7 @@ from sympflow.compiler.functions import where
 from sympflow.hamiltonian.kepler import coefficients, dot, kepler_changes, moved, series, varied
 from sympflow.hamiltonian.planets import Frame
 from sympflow.kernels.protocol import Batch, Kernel, Run, Steps, Task, run_states
+from sympflow.kernels.reverse import Chained
 from sympflow.kernels.rollouts import Columns, Rollouts, zeros
 from sympflow.kernels.runs import Numbers, Room
 from sympflow.kernels.tangents import EVERY, TangentKernel, exponent_of
@@ -705,6 +706,12 @@ class KeplerKernel(Kernel):
         first, second = sorted((int(one[k]), int(other[k])))
         return f" Bodies {first} and {second} were {distance[k]:.4g} apart, {radii[k]:.3g} Hill radii."
 
+    def check_reverse(self) -> None:
+        self.loops.code(self.form._replace(vectors=1))
+
+    def recorded(self, task: Task) -> Chained:
+        return Chained(self, task)
+
     def step(self, h: ArrayLike, y: np.ndarray, t: ArrayLike = 0.0) -> Steps:
         return Steps(self.jvp(h, y)[0])
 
@@ -735,6 +742,13 @@ class KeplerFlowKernel(Kernel):
         found = kernel.runs(task)
         self.remark = kernel.remark
         return found
+
+    def check_reverse(self) -> None:
+        for kernel in (self.trained, self.between):
+            kernel.check_reverse()
+
+    def recorded(self, task: Task) -> Chained:
+        return Chained(self, task)
 
     def step(self, h: ArrayLike, y: np.ndarray, t: ArrayLike = 0.0) -> Steps:
         return Steps(self._moved(h, y, False)[0])

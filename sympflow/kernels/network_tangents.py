@@ -81,22 +81,28 @@ class NetworkTangents:
         by_state: np.ndarray,
         by_velocity: np.ndarray | None = None,
         by_start: np.ndarray | None = None,
+        *,
+        weights: bool = True,
     ) -> np.ndarray:
         """J (n, 2d, N), the derivatives of 2d functions of ψ̄ and d/dt ψ̄ by the parameters.
 
         `by_state` (N, 2d, 2d) are the derivatives of the functions by ψ̄_t(x), `by_velocity` (2d,) those of each by its
         component of d/dt ψ̄_t(x), if they depend on that; `by_start` (2d, 2d, N) is filled with those by x, without
-        those of constants. The next call for as many points overwrites J: it is tens of megabytes.
+        those of constants. The next call for as many points overwrites J: it is tens of megabytes. Without `weights`
+        J is not made.
         """
         velocity, m, N = by_velocity is not None, 2 * self.ndof, len(t)
         key, shape = (velocity, N), (len(parameters), m, max(N, LANES))
-        if key not in self._kept:
+        if not weights:
+            J = np.empty((0, m, N))
+        elif key not in self._kept:
             self._kept = {k: J for k, J in self._kept.items() if k[0] != velocity} | {key: np.empty(shape)}
-        J = self._kept[key]
+        if weights:
+            J = self._kept[key]
         start = np.empty((m, m, shape[2]) if by_start is not None else 0)
         by = np.zeros(m) if by_velocity is None else np.ascontiguousarray(by_velocity)
         factors = [filled(by_state.transpose(1, 2, 0), LANES), by, self._units, self._places, J, start]
-        flags = len(self._places), int(by_start is not None)
+        flags = len(self._places) if weights else 0, int(by_start is not None)
         self._run("jacobian", velocity, 10 * self.ndof, (parameters, t, x, constants), factors, *flags)
         if by_start is not None:
             by_start[:] = start[..., :N]

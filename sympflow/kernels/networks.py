@@ -14,8 +14,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache, partial
-from typing import Any, NamedTuple
+from functools import cache, cached_property, partial
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -26,9 +26,13 @@ from sympflow.compiler.functions import fma
 from sympflow.compiler.program import traced
 from sympflow.kernels.activations import SIGMAS, bent
 from sympflow.kernels.protocol import Kernel, Run, Steps, Task, both_ways, run_states
+from sympflow.kernels.reverse import Chained
 from sympflow.kernels.rollouts import ONE, Columns, Rollouts, aligned
 from sympflow.kernels.runs import Numbers, Room
 from sympflow.lazy import needed
+
+if TYPE_CHECKING:
+    from sympflow.kernels.network_tangents import NetworkTangents
 
 __all__ = ["MLPFlowKernel", "NetworkLayer"]
 
@@ -69,6 +73,7 @@ class MLPFlowKernel(Kernel):
             )
         self._given = ndof, layers
         self._rollouts = _NetworkRollouts(ndof, layers)
+        self._widths = {tuple(map(len, layer.biases)) for layer in layers}
 
     def __reduce__(self) -> tuple[Any, ...]:
         return MLPFlowKernel, self._given
@@ -87,6 +92,45 @@ class MLPFlowKernel(Kernel):
             return run_states(rollout, task, y.shape[1], STEP, start).states[:, 0]
 
         return Steps(both_ways(one_way, lengths, y))
+
+    def check_reverse(self) -> None:
+        if self._derivatives is None:
+            raise NotCompiled(
+                "`flow` has networks of several sizes, or an activation of its own, which have no compiled reverse: "
+                "use backend='array'."
+            )
+
+    def recorded(self, task: Task) -> Chained:
+        return Chained(self, task)
+
+    def tangents(self, h: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+        if self._derivatives is None:
+            return None
+        made, weights = self._derivatives
+        N, m = y.shape
+        out, by_start = self.step(h, y).states, np.empty((m, m, N))
+        starts = np.where(h[:, None] < 0, out, y)  # of the inverse those of ψ̄ from where it leads, A⁻¹ = −ΩAᵀΩ
+        by_state = np.broadcast_to(np.eye(m), (N, m, m))
+        made.jacobian(weights, abs(h), starts, np.empty((0, N)), by_state, by_start=by_start, weights=False)
+        A = by_start.transpose(2, 0, 1)
+        d = m // 2
+        inverse = np.block([[A[:, d:, d:], -A[:, d:, :d]], [-A[:, :d, d:], A[:, :d, :d]]]).swapaxes(1, 2)
+        return out, np.where(h[:, None, None] < 0, inverse, A)
+
+    @cached_property
+    def _derivatives(self) -> tuple[NetworkTangents, np.ndarray] | None:
+        """The compiled derivatives of layers that are alike, with the weights as these take them."""
+        from sympflow.kernels.network_tangents import NetworkTangents, TrainedNetwork
+
+        ndof, layers = self._given
+        if len(self._widths) > 1 or layers[0].activation not in SIGMAS:
+            return None
+        weights = [
+            np.concatenate([np.ravel(x) for x in (one.K, one.k, one.w, *one.biases, *one.weights)]) for one in layers
+        ]
+        (widths,) = self._widths
+        networks = [TrainedNetwork(ndof, widths, layers[0].activation, np.ones(len(x))) for x in weights]
+        return NetworkTangents(ndof, [layer.is_kick for layer in layers], networks), np.concatenate(weights)
 
 
 class _Layout(NamedTuple):

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from sympflow.kernels.protocol import Batch, Task, begun_in, end_finite
+from sympflow.kernels.protocol import Batch, Kernel, RunCheckpoint, Task, begun_in, end_finite
 from sympflow.kernels.rollouts import aligned, zeros
 from sympflow.kernels.threads import BLOCK, NEVER, given, run_one, run_rows
 
-__all__ = ["Between", "Recorded"]
+__all__ = ["Between", "Chained", "Recorded"]
 
 MOST_KEPT = 2**23  # numbers of the states that are kept from a run, 64 MB
 SEGMENT = 2**18  # numbers of the states of a segment, which is run again: 2 MB
@@ -177,3 +177,56 @@ class Between:
         """As `Recorded.pulled`."""
         of_states, of_values = self._run.pulled(self._out(cotangents[:, self._begun :]), slopes)
         return self._into(of_states) + cotangents[:, : self._begun].sum(1), of_values
+
+
+class Chained:
+    """A run of an autonomous kernel whose cotangents are pulled back by the Jacobians of its steps, as of `Recorded`.
+
+    The Jacobians of a segment are made together. Where there are several, the place at which each begins is kept, and
+    it is run again, with the same bits.
+    """
+
+    def __init__(self, kernel: Kernel, task: Task) -> None:
+        self._kernel = kernel
+        self._task = task = task._replace(y0=given(task.y0), save=given(task.save, np.int64))
+        n_rows, size = task.y0.shape
+        steps = max(1, SEGMENT // (n_rows * size * size))
+        self._ends = [*pairwise([*range(0, task.n_steps, steps), task.n_steps])]
+        self._starts, self._places = [task.y0], [RunCheckpoint()]
+        self._states: np.ndarray | None = None
+        self.n_finite, found = np.full(n_rows, task.n_steps), [task.y0[:, None].repeat(begun_in(task.save), axis=1)]
+        for first, to in self._ends:
+            states, n_finite = self._run(len(self._places) - 1)
+            self.n_finite = np.where(n_finite < to, np.minimum(self.n_finite, n_finite), self.n_finite)
+            found.append(states[:, task.save[slice(*self._asked(first, to))] - first - 1])
+            self._starts.append(states[:, -1])
+            self._states = states if to - first == task.n_steps else None
+        self.states = np.concatenate(found, axis=1)
+
+    def _asked(self, first: int, to: int) -> list[int]:
+        """Where the outputs after steps in first + 1 … to begin and end."""
+        return self._task.save.searchsorted((first, to), "right").tolist()
+
+    def _run(self, i: int) -> tuple[np.ndarray, np.ndarray]:
+        """The states after all steps of a segment, and the last finite ones; the place after it, if that is new."""
+        (first, to), place = self._ends[i], self._places[i]
+        carry = RunCheckpoint(place.steps, place.running)
+        run = self._kernel.runs(self._task._replace(n_steps=to, save=np.arange(first + 1, to + 1), carry=carry))
+        if len(self._places) == i + 1:
+            self._places.append(carry)
+        return run.states, run.n_finite
+
+    def pulled(self, cotangents: np.ndarray, slopes: bool) -> tuple[np.ndarray, np.ndarray]:
+        """The cotangents of the states (N, 2d), for those of the outputs (N, len(save), 2d)."""
+        (h, y0, *_), total = self._task, np.zeros_like(self._task.y0)
+        for i, (first, to) in reversed([*enumerate(self._ends)]):
+            states = self._run(i)[0] if self._states is None else self._states
+            before = np.concatenate([self._starts[i][:, None], states[:, :-1]], axis=1).reshape(-1, y0.shape[1])
+            made = self._kernel.tangents(np.full(len(before), h), before)
+            assert made is not None  # after `check_reverse`
+            reversed_steps = made[1].reshape(*states.shape, -1).swapaxes(-1, -2)
+            for n in range(to, first, -1):
+                changed = total + cotangents[:, slice(*self._asked(n - 1, n))].sum(1)
+                changed = np.matmul(reversed_steps[:, n - first - 1], changed[..., None])[..., 0]
+                total = np.where(n <= self.n_finite[:, None], changed, 0.0)
+        return total + cotangents[:, : begun_in(self._task.save)].sum(1), np.zeros((0, len(y0)))

@@ -5,10 +5,10 @@ import pytest
 import torch
 from scipy.interpolate import CubicSpline
 
-from sympflow import Box, HamiltonianSystem, get, solve
+from sympflow import Box, HamiltonianSystem, SympFlow, get, solve
 from sympflow.flow.shipped import named
 from sympflow.kernels import reverse
-from sympflow.systems import driven_pendulum, henon_heiles
+from sympflow.systems import driven_pendulum, henon_heiles, solar_system
 
 CUBIC = HamiltonianSystem.from_sympy(
     "(p1**2/m + p2**2)/2 + k*(q1**2 + q2**2)/2 + g*(q1**2*q2 - q2**3/3)", params={"k": 1.0, "g": 0.9, "m": 1.2}
@@ -47,6 +47,7 @@ SYSTEMS = [
     (GEODESIC, "tao4"),
     (DRIVEN, "kahan_li8_parts"),
     *((flow.system, flow) for flow in FLOWS),
+    (KEPLER, SympFlow(ndof=2, pairs=2, hidden=(7, 5), activation="swish", dt=0.1).requires_grad_(False)),
 ]
 RUNS = [
     {"t_span": (0, 2), "dt": 0.1, "t_eval": [2.0]},
@@ -118,8 +119,19 @@ def test_gradients_by_parameters(system, method, params, run):
         np.testing.assert_allclose(float(gradient.sum()), difference, rtol=1e-6, atol=1e-7)
 
 
+@pytest.mark.parametrize(("method", "batch"), [("wisdom_holman", ()), ("kepler_aba1064", (2,))])
+def test_gradients_of_planets(method, batch):
+    system, found = solar_system(2), []
+    y0 = system.y0 * np.random.default_rng(0).uniform(0.999, 1.001, (*batch, len(system.y0)))
+    for backend in ("compiled", "array"):
+        y = torch.tensor(y0, requires_grad=True)
+        sol = solve(system, method, (0, 30), y, dt=4.0, t_eval=[0.0, 8.0, 29.0, 30.0], backend=backend)
+        found.append(torch.autograd.grad(weighted(sol), y)[0])
+    torch.testing.assert_close(*found, rtol=1e-12, atol=1e-12 * float(found[1].abs().max()))
+
+
 @pytest.mark.parametrize("rows", [1, 300])
-@pytest.mark.parametrize("method", ["verlet", "gauss_legendre4"])
+@pytest.mark.parametrize("method", ["verlet", "gauss_legendre4", SYSTEMS[-1][1]])
 def test_segments_give_the_same_bits(method, rows, monkeypatch):
     y0, found = start(CUBIC, (rows,)), []
     for most in (reverse.MOST_KEPT, 0):
