@@ -103,7 +103,14 @@ class NetworkTangents:
         by = np.zeros(m) if by_velocity is None else np.ascontiguousarray(by_velocity)
         factors = [filled(by_state.transpose(1, 2, 0), LANES), by, self._units, self._places, J, start]
         flags = len(self._places) if weights else 0, int(by_start is not None)
-        self._run("jacobian", velocity, 10 * self.ndof, (parameters, t, x, constants), factors, *flags)
+        self._run(
+            "jacobian" if weights else "by start",
+            velocity,
+            10 * self.ndof,
+            (parameters, t, x, constants),
+            factors,
+            *flags,
+        )
         if by_start is not None:
             by_start[:] = start[..., :N]
         return J[..., :N]
@@ -239,12 +246,16 @@ class _Sweeps:
             zero = self.code.constant(0.0, REGISTER)
             target.add(j, (sign, self.product(h, lambda i: self.weight(i * inputs + j), zero, r.__getitem__)))
 
-    def add_sensitivities(self, x: Any, t: Any, sign: Value, j: Value) -> None:
-        """Add sign times the derivatives of ∂_jV by the weights to G, by x to H."""
+    def add_sensitivities(self, x: Any, t: Any, sign: Value, j: Value, weights: bool) -> None:
+        """Add sign times the derivatives of ∂_jV by x to H, and by the `weights` to G."""
         code, sizes, rows = self.code, self.sizes, self.rows
         h, n, inputs, d = sizes.h, sizes.n, sizes.inputs, sizes.ndof
         z, s, u, R, r, aj, zj, A, RA = (rows[name] for name in ("z", "s", "u", "R", "r", "aj", "zj", "A", "RA"))
         G, zero = rows["G"].part(j * sizes.size), code.constant(0.0, REGISTER)
+
+        def add(place: Any, *products: Any) -> None:
+            if weights:
+                G.add(place, *products)
 
         def along(at: Value, a: Any) -> None:
             aj[at], zj[at] = a, s[at] * a
@@ -260,23 +271,23 @@ class _Sweeps:
             with code.over(h) as i:
                 at = level * h + i
                 A[i] = a = fma(R[at], u[at] * aj[at], RA[i] * s[at])
-                G.add(at + self.b, (sign, a))
+                add(at + self.b, (sign, a))
             with code.given(level > 0):
                 below = (level - 1) * h
                 with code.over(h) as i:
                     row, r_i, A_i = (below + i) * h + self.W, sign * r[level * h + i], sign * A[i]
-                    with code.over(h) as m:
-                        G.add(row + m, (r_i, zj[below + m]), (A_i, z[below + m]))
+                    with code.over(h if weights else 0) as m:
+                        add(row + m, (r_i, zj[below + m]), (A_i, z[below + m]))
                 with code.over(h) as m:
                     column = below * h + m + self.W
                     RA[m] = self.product(h, lambda i: self.weight(column + i * h), zero, A.__getitem__)
         with code.over(h) as i:
             A_i = sign * A[i]
-            with code.over(inputs) as m:
-                G.add(i * inputs + m, (A_i, x[m]))
-            G.add(i * inputs + j, (sign, r[i]))
-            G.add(i + self.k, (A_i, t))
-            G.add(i + self.w, (sign, zj[i + (n - 1) * h]))
+            with code.over(inputs if weights else 0) as m:
+                add(i * inputs + m, (A_i, x[m]))
+            add(i * inputs + j, (sign, r[i]))
+            add(i + self.k, (A_i, t))
+            add(i + self.w, (sign, zj[i + (n - 1) * h]))
         self.add_moved(A, sign, rows["H"].part(j * d))
 
 
@@ -377,7 +388,7 @@ class _Points:
                 with code.over(d) as m:
                     code.store(end[m + part * inputs], out, (m + part * d) * self.n_points + begin)
 
-    def jacobian(self) -> None:
+    def jacobian(self, weights: bool = True) -> None:
         """See `NetworkTangents.jacobian`."""
         code, sizes, d, inputs, size = self.code, self.sizes, self.sizes.ndof, self.sizes.inputs, self.sizes.size
         by_state, by_velocity, units, places, J, by_start = self.more
@@ -398,14 +409,14 @@ class _Points:
                 before = self.states.part(i * sizes.state)
                 x = code.select(kick, 0 * i, 0 * i + inputs)
                 old, new = code.select(kick, 0 * i + d, 0 * i), code.select(kick, 0 * i, 0 * i + d)
-                with code.over(d * size) as m:
+                with code.over(d * size if weights else 0) as m:
                     G[m] = zero
                 with code.over(d * d) as m:
                     H[m] = zero
                 with code.over(2) as k:  # the columns t and 0
                     sweeps, coordinates, times = self.swept(theta, before, x, k, t)
                     with code.over(d) as j:
-                        sweeps.add_sensitivities(coordinates, times, code.splat(self.share(k), LANES), j)
+                        sweeps.add_sensitivities(coordinates, times, code.splat(self.share(k), LANES), j, weights)
                 with code.over(n_own) as parameter:
                     place, number = code.load(places, parameter, INT), i * n_own + parameter
                     unit = code.splat(sign * code.load(units, number), LANES)
@@ -435,8 +446,12 @@ class _Points:
 
 @cache
 def _compiled(name: str, sizes: _Sizes, activation: str, velocity: bool) -> Callable[..., None]:
-    """The function `values` or `jacobian`."""
-    more, flags = {"values": (1, 0), "jacobian": (6, 2)}[name]
-    code = begun(name, [*[POINTER] * (6 + more), *[INT] * (4 + flags)])
-    getattr(_Points(code, sizes, activation, velocity, more), name)()
+    """The function `values`, or `jacobian`, with derivatives by the weights or without ("by start")."""
+    more, flags = (1, 0) if name == "values" else (6, 2)
+    code = begun("tangents", [*[POINTER] * (6 + more), *[INT] * (4 + flags)])
+    points = _Points(code, sizes, activation, velocity, more)
+    if name == "values":
+        points.values()
+    else:
+        points.jacobian(name == "jacobian")
     return finished(code)
