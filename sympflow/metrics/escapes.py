@@ -17,6 +17,7 @@ from sympflow.integrators.diagnosis import try_steps
 from sympflow.integrators.grid import Grid
 from sympflow.integrators.impulses import landings, pieces_of
 from sympflow.integrators.registry import naming_plugin
+from sympflow.integrators.steppers import Stepper
 from sympflow.metrics.crossings import bisected
 from sympflow.metrics.orbits import OfOrbits, Orbits, checked_orbits, of_many
 from sympflow.systems.given import GivenSystem, given_system
@@ -196,7 +197,7 @@ def _escapes(
                     states, _ = stepper.rollout(y, h, n, np.arange(n + 1), grid.time(k))
                 else:
                     n, h = 1, grid.remainder
-                    states = np.stack([y, integrator.step(system, grid.time(k), y, h)])
+                    states = np.stack([y, stepper.shorter(y, h, grid.time(k))])
             finite = np.isfinite(states).all(-1)
             left = ~finite
             left[finite] = ~_inside(region, states[finite])
@@ -208,20 +209,18 @@ def _escapes(
             found = where[lanes[escaped]]
             begin = grid.t0 + (k + first[lanes[escaped]] - 1) * grid.h
             if len(found):
-                part, state[found] = _located(integrator, system, begin, before[escaped], h, region)
+                part, state[found] = _located(stepper, begin, before[escaped], h, region)
                 time[found] = begin + part
             y, where = states[-1, ~gone], where[~gone]
             k += n
     return time, state, status
 
 
-def _located(
-    integrator: FixedStep, system: HamiltonianSystem, times: Any, y: np.ndarray, h: float, region: Outside
-) -> tuple[np.ndarray, np.ndarray]:
+def _located(stepper: Stepper, times: Any, y: np.ndarray, h: float, region: Outside) -> tuple[np.ndarray, np.ndarray]:
     """The parts (n,) of steps from y (n, 2d) at times (n,) after which states are outside, and these states."""
 
     def inside(part: np.ndarray) -> np.ndarray:
-        return _inside(region, np.asarray(integrator.step(system, times, y, part * h)))
+        return _inside(region, np.asarray(stepper.shorter(y, part * h, times)))
 
     _, out = bisected(np.zeros(len(y)), np.ones(len(y)), inside, HALVINGS)
-    return out * h, np.asarray(integrator.step(system, times, y, out * h))
+    return out * h, np.asarray(stepper.shorter(y, out * h, times))
