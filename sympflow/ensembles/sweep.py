@@ -261,7 +261,7 @@ def _runs_together(
     """
     from sympflow.hamiltonian.parameter_rows import ParameterRows
 
-    if not axes or system.symbols is None:
+    if not axes or not system.definition.symbolic:
         return False
     general = {name: np.array([value]) for name, value in _general(axes).items()}
     try:

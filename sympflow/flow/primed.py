@@ -372,7 +372,7 @@ def _force_gradient_of(system: HamiltonianSystem, asked: bool | None, curvature:
         asked = system.quadratic_kinetic and system.has_hessian_vector
     elif asked and not system.quadratic_kinetic:
         raise ValueError("`force_gradient` needs a kinetic energy ½ pᵀM⁻¹p: leave it out.")
-    known = system.symbols is not None or system.local is not None
+    known = system.definition.symbolic or system.local is not None
     if curvature and not (asked and known):
         remedy = "leave it out"
         if not known:
@@ -404,7 +404,7 @@ def _monomials_of(
         raise ValueError(f"`polynomial` must be a positive integer, its degree; got {polynomial!r}: 6 is usual.")
     if force_gradient or curvature:
         raise ValueError("`polynomial` stands in place of `force_gradient` and `curvature`: leave these out.")
-    if system.symbols is None or not system.quadratic_kinetic:
+    if not system.definition.symbolic or not system.quadratic_kinetic:
         raise ValueError(
             "`polynomial` is for symbolic systems, H = ½ pᵀM⁻¹p + V(q): leave it out, or define the system with "
             "HamiltonianSystem.from_sympy."

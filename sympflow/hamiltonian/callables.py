@@ -44,6 +44,7 @@ from sympflow.hamiltonian.formulas import (
 )
 from sympflow.hamiltonian.function_checks import Tested, check_writes, probe_states, test
 from sympflow.hamiltonian.layered import LayeredPotential
+from sympflow.hamiltonian.linear_part import simplest
 from sympflow.hamiltonian.times import probe_times
 
 MOST_BY_ARRAYS = 2000  # operations of a gradient, beyond which torch differentiates its own functions of arrays
@@ -105,7 +106,7 @@ class CallableHamiltonian(Definition):
         if form is None or self.separable:
             return None
         H, inputs = form.program, form.program.inputs
-        is_sum, quadratic, inverse_mass = kinetic_matrix(H.outputs[0], inputs, d)
+        is_sum, M = kinetic_matrix(H.outputs[0], inputs, d)
         if not is_sum:
             return None
         nothing = [0.0] * d
@@ -114,8 +115,8 @@ class CallableHamiltonian(Definition):
         p0 = nothing if np.isfinite(H(*map(np.float64, (*elsewhere, *nothing)))[0]) else state[d:].tolist()
         made = CallableHamiltonian(d, _AtRest(self._functions[1], p0), None, None, None, self.given, self.timed)
         made.guard = self.check_unchanged
-        if p0 is nothing and quadratic:
-            return made, inverse_mass, True
+        if p0 is nothing and M is not None:
+            return made, simplest(np.array(M)), True
 
         def kinetic(*p: Any) -> list[Any]:
             return [H(*elsewhere, *p)[0] - H(*elsewhere, *p0)[0]]

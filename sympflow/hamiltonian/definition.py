@@ -40,6 +40,7 @@ class Definition:
     ndof: int
     separable: bool
     symbols: Any = None  # the definition itself, if it is a SymbolicHamiltonian
+    symbolic: bool = False  # True of H as a text or an expression, which has `symbols` once they are asked for
     numba_functions: tuple[Any, Any, Any] | None = None  # V, gradient, hessian_vector
     differentiates_itself: bool = False  # by torch alone, in which the functions are written
     has_hessian_vector: bool = True  # of arrays: not where a gradient was given without it

@@ -236,7 +236,7 @@ def _read(expression: str | None, ndof: int) -> Any:
     if expression is None:
         return None
     if (found := written(expression)) is not None:
-        return Hamiltonian("", *found, True) if found[0].ndof == ndof else None
+        return Hamiltonian("", found, found.inverse_mass, True) if found.ndof == ndof else None
     from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 
     symbols = None

@@ -29,7 +29,6 @@ from sympflow.compiler.program import (
     tangent,
     traced,
 )
-from sympflow.hamiltonian.linear_part import simplest
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.poles import Poles
@@ -112,24 +111,26 @@ class Entries:
 class TracedHamiltonian:
     """The form of a system of Python functions, as `SymbolicHamiltonian` is that of a system of symbols.
 
-    The program is V of q, if it is `separable`, or H of q and p; of a driven system the time comes first.
+    The program is V of q, if it is `separable`, or H of q and p; of a driven system the time comes first, and
+    `parameters`, which V and the rows of M⁻¹ may have, are last.
     """
 
-    parameters: tuple[Variable, ...] = ()
-    values: tuple[float, ...] = ()
     samples: Mapping[str, Any] = MappingProxyType({})
+    text: str | None = None
 
     def __init__(
         self,
         ndof: int,
         program: Program,
         separable: bool,
-        inverse_mass: np.ndarray | None = None,
+        inverse_mass: np.ndarray | list[list[Any]] | None = None,
         timed: bool = False,
         kinetic: Program | None = None,
-        text: str | None = None,
+        parameters: Sequence[Variable] = (),
+        values: Sequence[float] = (),
     ) -> None:
-        self.ndof, self.program, self.separable, self._timed, self.text = ndof, program, separable, timed, text
+        self.ndof, self.program, self.separable, self._timed = ndof, program, separable, timed
+        self.parameters, self.values = tuple(parameters), tuple(values)
         self.q = tuple(Variable(f"q{i + 1}") for i in range(ndof))
         self.p = tuple(Variable(f"p{i + 1}") for i in range(ndof))
         self.time = Variable("t") if timed else None
@@ -140,38 +141,37 @@ class TracedHamiltonian:
         if not separable:
             self.H = Formula(program, (*times, *self.q, *self.p))
             return
+        variables = (*self.p, *self.parameters)
         if kinetic is None:
             M = np.ones(ndof) if inverse_mass is None else inverse_mass
-            rows: list[list[Any]] = [[*row] for row in (np.diag(M) if M.ndim == 1 else M).astype(object)]
+            rows = M if isinstance(M, list) else [[*row] for row in (np.diag(M) if M.ndim == 1 else M).astype(object)]
             self.inverse_mass = Entries(rows)
-            kinetic = traced(lambda *p: [_kinetic(rows, p)], *(s.name for s in self.p))
-        self.T = Formula(kinetic, self.p)
-        self._set_potential(Formula(program, (*times, *self.q)))
+
+            def energy(*numbers: Any) -> list[Any]:
+                known = evaluator(dict(zip(variables, numbers, strict=True)))
+                return [_kinetic([[known(x) for x in row] for row in rows], numbers[:ndof])]
+
+            kinetic = traced(energy, *(s.name for s in variables))
+        self.T = Formula(kinetic, variables)
+        self._set_potential(Formula(program, (*times, *self.q, *self.parameters)[: len(program.inputs)]))
 
     def named(self, names: Sequence[str]) -> TracedHamiltonian:
         """The same with entries of M⁻¹ as parameters of these names: those of the diagonal, or all, row by row."""
-        d, form = self.ndof, TracedHamiltonian(self.ndof, self.program, True, timed=self._timed)
-        form.parameters, form.values = tuple(map(Variable, names)), (1.0,) * len(names)
-        rows: list[list[Any]]
+        d, letters = self.ndof, [*map(Variable, names)]
+        rows: list[list[Any]] = [letters[i * d : (i + 1) * d] for i in range(d)]
         if len(names) == d:
-            rows = [[s if i == j else 0.0 for j in range(d)] for i, s in enumerate(form.parameters)]
-        else:
-            rows = [[*form.parameters[i * d : (i + 1) * d]] for i in range(d)]
-        form.inverse_mass, letters = Entries(rows), [s.name for s in (*self.p, *form.parameters)]
-
-        def kinetic(*numbers: Any) -> list[Any]:
-            known = dict(zip(form.parameters, numbers[d:], strict=True))
-            return [_kinetic([[known.get(x, x) for x in row] for row in rows], numbers[:d])]
-
-        form.T = Formula(traced(kinetic, *letters), (*self.p, *form.parameters))
-        form._set_potential(self.V)
-        return form
+            rows = [[s if i == j else 0.0 for j in range(d)] for i, s in enumerate(letters)]
+        return TracedHamiltonian(d, self.program, True, rows, self._timed, None, letters, (1.0,) * len(names))
 
     def _set_potential(self, V: Formula) -> None:
-        T, n = self.T, len(V.variables)
-        variables = (*V.variables, *T.variables)
-        H = traced(lambda *x: [V.program(*x[:n])[0] + T.program(*x[n:])[0]], *(s.name for s in variables))
-        self.V, self.H = V, Formula(H, variables)
+        T, together = self.T, dict.fromkeys((*V.variables, *self.T.variables))
+        variables = *(s for s in together if s not in self.parameters), *self.parameters
+
+        def total(*numbers: Any) -> list[Any]:
+            known = dict(zip(variables, numbers, strict=True))
+            return [V.value(known) + T.value(known)]
+
+        self.V, self.H = V, Formula(traced(total, *(s.name for s in variables)), variables)
 
     def __getstate__(self) -> dict[str, Any]:
         return {name: value for name, value in vars(self).items() if name != "written"}
@@ -198,14 +198,12 @@ class TracedHamiltonian:
 
     @cached_property
     def written(self) -> SymbolicHamiltonian | None:
-        """The same in symbols, of the text if H is one, for methods that look for parts of H; None of a long one."""
-        if self.text is None and len(self.H) > MOST_IN_SYMBOLS:
+        """The same in symbols, for methods that look for parts of H; None of a long one."""
+        if len(self.H) > MOST_IN_SYMBOLS:
             return None
         from sympflow.hamiltonian.recorded import NotRecorded, in_symbols
         from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 
-        if self.text is not None:
-            return SymbolicHamiltonian(self.text)
         try:
             symbols = SymbolicHamiltonian(in_symbols(self.H.program), time="t" if self.time else None)
         except (NotRecorded, ValueError, TypeError):
@@ -229,17 +227,21 @@ class TracedHamiltonian:
 
     # arrays, of V in q or of H in [q, p] --------------------------------------------------------------------------
 
+    def _states(self, program: Program, both: bool) -> tuple[Traced, ...]:
+        """The inputs of a program that are q, or `both` q and p."""
+        first = self.time is not None
+        return program.inputs[first : first + self.ndof * (1 + both)]
+
     @cached_property
     def _slope(self) -> Program:
-        inputs = self.program.inputs
-        return Program(inputs, gradient(self.program.outputs[0], inputs[1:] if self.time else inputs))
+        x = self._states(self.program, not self.separable)
+        return Program(self.program.inputs, gradient(self.program.outputs[0], x))
 
     @cached_property
     def _hessian(self) -> Program:
         """The Hessian row by row to the diagonal."""
-        inputs = self.program.inputs
-        x = inputs[1:] if self.time else inputs
-        return Program(inputs, [entry for i, s in enumerate(self._slope.outputs) for entry in gradient(s, x[: i + 1])])
+        x, slopes = self._states(self.program, not self.separable), self._slope.outputs
+        return Program(self.program.inputs, [entry for i, s in enumerate(slopes) for entry in gradient(s, x[: i + 1])])
 
     @cached_property
     def _along(self) -> tuple[Program, Program]:
@@ -256,6 +258,19 @@ class TracedHamiltonian:
 
         both = traced(products, *names)
         return Program(both.inputs[: n + d], both.outputs[:d]), Program(both.inputs, both.outputs[d:])
+
+    def hamiltonian(self, y: Array, *t: Any, numbers: Sequence[Any] = ()) -> Array:
+        """H of y (..., 2d), with `numbers` for the parameters: (...)."""
+        return self._assembled(self.H.program, y, *t, numbers=numbers)[..., 0]
+
+    def hamiltonian_gradient(self, y: Array, *t: Any, numbers: Sequence[Any] = ()) -> Array:
+        """∇H of y (..., 2d), with `numbers` for the parameters."""
+        return self._assembled(self._whole_slope, y, *t, numbers=numbers)
+
+    @cached_property
+    def _whole_slope(self) -> Program:
+        program = self.H.program
+        return Program(program.inputs, gradient(program.outputs[0], self._states(program, True)))
 
     def value(self, x: Array, *t: Any) -> Array:
         """V of q (..., d), or H of y (..., 2d): (...)."""
@@ -289,15 +304,17 @@ class TracedHamiltonian:
         """∂V/∂t or ∂H/∂t, (...)."""
         return self._assembled(self._in_time, x, t)[..., 0]
 
-    def _assembled(self, program: Program, x: Array, *t: Any, more: Sequence[Array] = ()) -> Array:
+    def _assembled(
+        self, program: Program, x: Array, *t: Any, more: Sequence[Array] = (), numbers: Sequence[Any] = ()
+    ) -> Array:
         arrays = (x, *more)
         columns = [a[..., i] for a in arrays for i in range(a.shape[-1])]
         times = t[: self.time is not None]
         if is_tensor(x):  # torch.compile knows no errstate
-            values = program(*(beside(s, x) for s in times), *columns)
+            values = program(*(beside(s, x) for s in times), *columns, *numbers)
         else:
             with np.errstate(all="ignore"):
-                values = program(*times, *columns)
+                values = program(*times, *columns, *numbers)
         return assemble(values, sum(columns[:: max(x.shape[-1], 1)]) if more else columns[0])
 
 
@@ -306,7 +323,7 @@ class TracedPoles:
 
     def __init__(self, form: TracedHamiltonian) -> None:
         self._form, program = form, form.H.program
-        inputs, self._vanishing = program.inputs[form.time is not None :], dict[int, Traced]()
+        inputs, self._vanishing = form._states(program, True), dict[int, Traced]()
         for x in program.operations:
             if x.name in _SINGULAR and not (x.name == "pow" and _is_whole(x.args[1])):
                 self._add(x.args[_SINGULAR[x.name]])
@@ -348,7 +365,7 @@ class TracedPoles:
 
     def look(self, y: np.ndarray, t: Any, numbers: Sequence[Any] = ()) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         times = () if self._form.time is None else (np.broadcast_to(t, y.shape[:-1]),)
-        found = self._program(*times, *np.moveaxis(y, -1, 0))
+        found = self._program(*times, *np.moveaxis(y, -1, 0), *numbers)
         values = np.stack([np.broadcast_to(x, y.shape[:-1]) for x in found], axis=-1)
         return values[..., :-2], values[..., -2], values[..., -1]
 
@@ -460,28 +477,42 @@ def _at_time(coefficients: Mapping[Variable, Formula], time: Any) -> list[Any]:
 def without_time(formulas: Sequence[Formula], time: Any) -> tuple[list[Formula], dict[Variable, Formula]]:
     """Formulas with coefficients for the largest parts that depend on the time alone; these as formulas of it."""
     found: dict[Variable, Formula] = {}
-    return [_without_time(f, time, found) for f in formulas], found
+    return [without(f, [time], found, "letter") for f in formulas], found
 
 
-def _without_time(f: Formula, time: Variable, found: dict[Variable, Formula]) -> Formula:
-    program, place = f.program, f.variables.index(time)
-    t = program.inputs[place]
-    moving = {x.order for x in program.inputs if x is not t}
+def without(
+    f: Formula,
+    fixed: Sequence[Variable],
+    found: dict[Variable, Formula],
+    prefix: str,
+    number: Callable[[Formula], float | None] = lambda part: None,
+) -> Formula:
+    """A formula with letters for its largest parts of `fixed` variables alone, or numbers, where there are such."""
+    program = f.program
+    own_inputs = dict(zip(f.variables, program.inputs, strict=True))
+    given = {own_inputs[s].order for s in fixed}
+    moving = {x.order for x in program.inputs if x.order not in given}
     for x in program.operations:
         if any(isinstance(a, Traced) and a.order in moving for a in x.args):
             moving.add(x.order)
     used = [a for x in program.operations if x.order in moving for a in x.args] + list(program.outputs)
-    own: dict[int, Variable] = {}
+    own, of = dict[int, Variable](), dict[int, Any]()
     conditions = {a.order for a in used if isinstance(a, Traced) and a.name in CONDITIONS}
     for a in used:
-        if isinstance(a, Traced) and a.order not in moving and a.order not in own:
-            own[a.order] = Variable(f"letter_{len(found)}")
-            number = where(a, 1.0, 0.0) if a.order in conditions else a
-            found[own[a.order]] = Formula(Program([t], [number]), (time,))
-    others = [(s, x) for s, x in zip(f.variables, program.inputs, strict=True) if x is not t]
+        if isinstance(a, Traced) and a.order not in moving and a.order not in own and a.order not in of:
+            within = {x.order for x in reached([a])}
+            names = [s for s in fixed if own_inputs[s].order in within]
+            value = where(a, 1.0, 0.0) if a.order in conditions else a
+            part = Formula(Program([own_inputs[s] for s in names], [value]), names)
+            if (known := number(part)) is None:
+                own[a.order] = Variable(f"{prefix}_{len(found)}")
+                found[own[a.order]] = part
+            else:
+                of[a.order] = known
+    others = [(s, x) for s, x in own_inputs.items() if s not in fixed]
     recording = Recording()
     inputs = [recording.input(s.name) for s, _ in others]
-    of: dict[int, Any] = {x.order: new for (_, x), new in zip(others, inputs, strict=True)}
+    of |= {x.order: new for (_, x), new in zip(others, inputs, strict=True)}
     letters = {order: recording.input(coefficient.name) for order, coefficient in own.items()}
     of |= {order: letter > 0.5 if order in conditions else letter for order, letter in letters.items()}
     for x in program.operations:
@@ -494,6 +525,35 @@ def _without_time(f: Formula, time: Variable, found: dict[Variable, Formula]) ->
     )
 
 
+KINDS = (0.0, 1.0, -1.0)
+"""Values of parts of H that depend on parameters alone with which H may have another structure."""
+
+
+def values_of(parts: Sequence[Formula], params: Mapping[str, float]) -> list[float]:
+    """Values of parts of H that depend on parameters alone, NaN where they are no numbers."""
+    with np.errstate(all="ignore"):
+        return [float(part.value({s: np.float64(params[s.name]) for s in part.variables})) for part in parts]
+
+
+def revalued(
+    parts: Sequence[Formula],
+    replaced: set[str],
+    letters: Sequence[Formula],
+    before: Mapping[str, float],
+    params: Mapping[str, float],
+) -> tuple[float, ...] | None:
+    """Values of the `letters` of H with others of its parameters; None where H may have another structure.
+
+    `parts` are all that depend on parameters alone, those that are 0, 1 or −1 too; `replaced` are numbers in H.
+    """
+    changed = {name for name, value in before.items() if params[name] != value}
+    lasting = [part for part in parts if part not in letters]
+    if changed & replaced or any(s.name in changed for part in lasting for s in part.variables):
+        return None
+    numbers = tuple(values_of(letters, params))
+    return numbers if all(math.isfinite(x) and x not in KINDS for x in numbers) else None
+
+
 def _kinetic(M: Sequence[Sequence[Any]], p: Sequence[Any]) -> Any:
     """½ pᵀM⁻¹p."""
     total: Any = 0.0
@@ -504,17 +564,25 @@ def _kinetic(M: Sequence[Sequence[Any]], p: Sequence[Any]) -> Any:
     return total
 
 
-def kinetic_matrix(H: Any, inputs: Sequence[Traced], d: int) -> tuple[bool, bool, np.ndarray | None]:
-    """True of a sum T(p) + V of the last d inputs and the others; True if T = ½ pᵀM⁻¹p; M⁻¹ in its simplest form."""
+def kinetic_matrix(
+    H: Any, inputs: Sequence[Traced], d: int, letters: Sequence[Traced] = (), numbers: Sequence[float] = ()
+) -> tuple[bool, list[list[Any]] | None]:
+    """True of a sum T(p) + V of the last d inputs and the others; the rows of M⁻¹, which may have letters, of ½ pᵀM⁻¹p.
+
+    They are None for another T, or where M⁻¹ is not positive by the `numbers` of the letters.
+    """
     p = inputs[-d:]
     velocity = gradient(H, p)
     if {x.order for x in inputs[:-d]} & {x.order for x in reached(velocity)}:
-        return False, False, None
-    M: Any = derivatives(velocity, p)
-    is_constant = all(isinstance(x, float) for row in M for x in row)
-    if not is_constant or any(Program(p, velocity)(*[0.0] * d)) or not np.linalg.eigvalsh(M)[0] > 0:
-        return True, False, None
-    return True, True, simplest(np.array(M))
+        return False, None
+    rows = derivatives(velocity, p)
+    entries = [x for row in rows for x in row]
+    if {x.order for x in p} & {x.order for x in reached(entries)}:
+        return True, None
+    with np.errstate(all="ignore"):
+        found = Program([*p, *letters], [*velocity, *entries])(*np.zeros(d), *map(np.float64, numbers))
+    M = np.array(found[d:]).reshape(d, d)
+    return True, rows if not any(found[:d]) and np.linalg.eigvalsh(M)[0] > 0 else None
 
 
 def evaluator(numbers: Mapping[Any, Any]) -> Callable[[Any], Any]:

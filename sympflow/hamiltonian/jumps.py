@@ -19,7 +19,8 @@ import sympy as sp
 from sympy.core.relational import Relational
 
 from sympflow.hamiltonian.definition import ASIDE
-from sympflow.hamiltonian.driving import JUMP, MOST_TURNS, Samples, sampled, with_symbols
+from sympflow.hamiltonian.driving import sampled, with_symbols
+from sympflow.hamiltonian.parameters import JUMP, MOST_TURNS, Samples
 from sympflow.hamiltonian.removable import X, cancelling, exact, removed, triangle, with_values
 
 MISMATCH = 1e-6

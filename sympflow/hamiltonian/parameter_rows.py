@@ -11,12 +11,11 @@ from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
-import sympy as sp
 
 from sympflow.arrays import differentiable, expanded, transformed, without_torch
-from sympflow.hamiltonian.removable import exact
+from sympflow.compiler import NotCompiled
+from sympflow.hamiltonian.formulas import Formula
 from sympflow.hamiltonian.scales import size_of_terms
-from sympflow.hamiltonian.symbolic import generate, printable
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.lazy import lately_kept
 
@@ -76,24 +75,24 @@ class ParameterRows:
 
     def by_form(self) -> Iterator[Rows]:
         """The trajectories by the `parametric` form of H; those whose values belong to the code, by their values."""
-        symbols = self.system.symbols
-        if symbols is None:
+        definition = self.system.definition
+        if not definition.symbolic:
             yield from self.distinct()
             return
         try:
-            parts, replaced = symbols.parametric_parts
-        except (TypeError, OverflowError):
+            parts, replaced = definition.parametric_parts
+        except (TypeError, OverflowError, NotCompiled):
             yield from self.distinct()
             return
         kinds = [_kind(self._part(part)) for part in parts if self._swept(part)]
-        kinds += [column for name, column in self._columns.items() if any(s.name == name for s in replaced)]
+        kinds += [column for name, column in self._columns.items() if name in replaced]
         for index in _groups(kinds) if kinds else [np.arange(math.prod(self.shape))]:
             rows = self.taken(index)
             system = self._formed(tuple(float(kind[index[0] if len(kind) > 1 else 0]) for kind in kinds), int(index[0]))
-            form = system.symbols.parametric
+            form = system.definition.parametric
             parameters = [rows._part(part) for part in form.meanings]
             swept = any(self._swept(part) for part in form.meanings)
-            if form is system.symbols or not swept or not all(np.isfinite(each).all() for each in parameters):
+            if form is system.definition or not swept or not all(np.isfinite(each).all() for each in parameters):
                 yield from (Rows(index[few], own) for few, own, _ in rows.distinct())
                 continue
             yield Rows(index, system, np.stack([np.broadcast_to(x, index.shape) for x in parameters]))
@@ -112,41 +111,29 @@ class ParameterRows:
             return self
         return ParameterRows(self.system, {name: column[index] for name, column in self._columns.items()})
 
-    def _swept(self, part: sp.Expr) -> bool:
-        return any(s.name in self._columns for s in part.free_symbols)
+    def _swept(self, part: Formula) -> bool:
+        return any(s.name in self._columns for s in part.variables)
 
-    def _part(self, part: sp.Expr) -> np.ndarray:
-        """The values of a part of H that depends on parameters alone, by SymPy; NaN where they are not real."""
-        fixed = self.system.symbols.written[1]
-        columns = {s: self._columns[s.name] for s in part.free_symbols if s.name in self._columns}
-        part = part.xreplace({s: value for s, value in fixed.items() if s not in columns})
-        if not columns:
-            return np.array([float(part)])
+    def _part(self, part: Formula) -> np.ndarray:
+        """The values of a part of H that depends on parameters alone; NaN where they are not real."""
+        params = {name: float(value) for name, value in self.system.params.items()} | self._columns
         with np.errstate(all="ignore"):
-            if part.is_Symbol:
-                return columns[part]
-            if part.is_Pow and part.base.is_Symbol and part.exp in _ROUNDED_ONCE:
-                return _ROUNDED_ONCE[part.exp](columns[part.base])
-        values = np.empty(math.prod(self.shape))
-        for index in _groups([*columns.values()]):
-            try:
-                values[index] = float(part.xreplace({s: exact(float(c[index[0]])) for s, c in columns.items()}))
-            except (TypeError, OverflowError):
-                values[index] = math.nan
-        return values
+            return np.atleast_1d(part.value({s: params[s.name] for s in part.variables}))
 
     def hamiltonian(self, y: np.ndarray, t: Any) -> np.ndarray:
         """H of each trajectory at its states y (*shape, ..., 2d) at times that broadcast to these: (*shape, ...)."""
-        return self._evaluated(y, t, "_hamiltonian", lambda system, y, t: system.hamiltonian(y, t))
+        return self._evaluated(y, t, _energy, lambda system, y, t: system.hamiltonian(y, t))
 
     def sizes_of_terms(self, y: np.ndarray, t: Any) -> np.ndarray:
         """½ Σ|y_i ∂H/∂y_i| of each trajectory, at states and times as those of `hamiltonian`."""
-        return self._evaluated(y, t, "_sizes", size_of_terms)
+        return self._evaluated(y, t, _size, size_of_terms)
 
-    def _evaluated(self, y: np.ndarray, t: Any, name: str, of_system: Callable[..., Any]) -> np.ndarray:
-        """A function of symbols, or else that of the system of each value, at states."""
-        symbols = self.system.symbols
-        if symbols is None or symbols.samples or symbols.impulses:
+    def _evaluated(
+        self, y: np.ndarray, t: Any, function: Callable[..., Any], of_system: Callable[..., Any]
+    ) -> np.ndarray:
+        """A function of H with its parameters as numbers, or else that of the system of each value, at states."""
+        definition = self.system.definition
+        if not definition.symbolic or definition.samples or definition.impulses:
             each = (y, np.broadcast_to(t, y.shape[:-1]))
             states, at = (x.reshape(math.prod(self.shape), *x.shape[len(self.shape) :]) for x in each)
             found = np.empty(states.shape[:-1])
@@ -154,25 +141,11 @@ class ParameterRows:
                 found[index] = of_system(system, states[index], at[index])
             return found.reshape(y.shape[:-1])
         more = (1,) * (y.ndim - 1 - len(self.shape))
-        columns = [value.reshape(*self.shape, *more) for value in self.values.values()]
-        times = () if symbols.time is None else (t,)
-        (values,) = getattr(self, name)(*(y[..., i] for i in range(2 * self.system.ndof)), *columns, *times)
+        numbers = [value.reshape(*self.shape, *more) for value in self.values.values()]
+        form = definition.named(tuple(self.values))
+        times = (np.broadcast_to(t, y.shape[:-1]),) if definition.timed else ()
+        values = function(form, y, *times, numbers=numbers)
         return np.broadcast_to(values, y.shape[:-1])
-
-    @cached_property
-    def _hamiltonian(self) -> Any:
-        return self._generated(lambda H, y: H)
-
-    @cached_property
-    def _sizes(self) -> Any:
-        return self._generated(lambda H, y: sp.Add(*[sp.Abs(s * sp.diff(H, s)) for s in y]) / 2)
-
-    def _generated(self, of: Callable[[sp.Expr, Sequence[sp.Symbol]], sp.Expr]) -> Any:
-        symbols = self.system.symbols
-        H, values = symbols.written
-        H = H.xreplace({s: value for s, value in values.items() if s.name not in self.values})
-        parameters, y = [sp.Symbol(name, real=True) for name in self.values], [*symbols.q, *symbols.p]
-        return generate([printable(of(H, y))], [*y, *parameters, *filter(None, [symbols.time])], "numpy")
 
     def __getstate__(self) -> dict[str, Any]:
         """The definition alone: functions cannot be pickled."""
@@ -182,12 +155,14 @@ class ParameterRows:
 
 _Key = tuple[tuple[str, ...], tuple[float, ...]]
 _FORMED: WeakKeyDictionary[HamiltonianSystem, dict[_Key, HamiltonianSystem]] = WeakKeyDictionary()
-_ROUNDED_ONCE: dict[Any, Callable[[np.ndarray], np.ndarray]] = {
-    sp.Integer(-1): lambda x: 1 / x,
-    sp.Integer(2): lambda x: x * x,
-    sp.Rational(1, 2): np.sqrt,
-}
-"""Powers that floats have exactly rounded, as SymPy has them."""
+
+
+def _energy(form: Any, y: np.ndarray, *t: Any, numbers: Sequence[Any]) -> np.ndarray:
+    return form.hamiltonian(y, *t, numbers=numbers)
+
+
+def _size(form: Any, y: np.ndarray, *t: Any, numbers: Sequence[Any]) -> np.ndarray:
+    return 0.5 * np.abs(y * form.gradient(y, *t, numbers=numbers)).sum(-1)
 
 
 def _kind(values: np.ndarray) -> np.ndarray:

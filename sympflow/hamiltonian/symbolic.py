@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-import numbers
 import re
-import reprlib
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
@@ -21,7 +19,6 @@ import sympy as sp
 from sympy.core.function import AppliedUndef
 from sympy.printing.codeprinter import PrintMethodNotImplementedError
 
-from sympflow.arguments import check_kept, plain
 from sympflow.arrays import Array, assemble, beside, concatenate, library_name
 from sympflow.compiler import NotCompiled
 from sympflow.compiler.functions import apply
@@ -30,15 +27,13 @@ from sympflow.compiler.program import gradient as slopes
 from sympflow.hamiltonian.definition import Definition
 from sympflow.hamiltonian.driving import (
     DURATION,
-    Samples,
-    check_span,
     drift,
-    is_spline,
     sampled,
     sampled_parameter,
     with_symbols,
 )
 from sympflow.hamiltonian.expression import COORDINATE, FUNCTIONS, complex_part, of_sympy, stated
+from sympflow.hamiltonian.formulas import Formula, Variable, revalued, values_of
 from sympflow.hamiltonian.jumps import (
     MOST_IMPULSES,
     MOST_POINTS,
@@ -53,12 +48,13 @@ from sympflow.hamiltonian.jumps import (
     split_impulses,
     touches,
 )
+from sympflow.hamiltonian.parameters import LARGEST, Samples, check_span, checked_params
 from sympflow.hamiltonian.poles import Poles, SymbolicPoles
 from sympflow.hamiltonian.recorded import recorded
 from sympflow.hamiltonian.removable import BOUNDED, Max, cancelling, exact, may_cancel, removed, with_values
 from sympflow.show.cards import cut
 
-LARGEST, TINY = sys.float_info.max, 1e-150
+TINY = 1e-150
 MOST_LEFT_OUT = 100  # degrees of freedom up to the last one that a formula may do without
 LONGEST_NAME = 40  # in messages
 MOST_WRITTEN = 16  # variables of a Hessian whose entries are written out
@@ -97,13 +93,14 @@ class SymbolicHamiltonian(Definition):
 
     H, V and T are expressions in the symbols `q`, `p` and `time`; V and T are None unless H = T(p) + V(q), each of t
     too. A `parametric` form has `parameters`, symbols for parts of H that depend on parameters alone, with their
-    `values` and, in the symbols of H as it was written, their `meanings`. `samples` are the functions of t that are
+    `values` and, by the parameters of H as it was written, their `meanings`. `samples` are the functions of t that are
     given by samples, by the names that `driving.sampled` has in H.
     """
 
+    symbolic = True
     parameters: tuple[sp.Symbol, ...] = ()
     values: tuple[float, ...] = ()
-    meanings: tuple[sp.Expr, ...] = ()
+    meanings: tuple[Formula, ...] = ()
     left_out: sp.Expr = sp.S.Zero
     """The terms of H without coordinates, in its parameters, which a form does not have."""
     _written: tuple[sp.Expr, dict[sp.Symbol, sp.Expr]] | None = None
@@ -202,10 +199,14 @@ class SymbolicHamiltonian(Definition):
         terms = sp.Add.make_args(H)
         form = self.like(sp.Add(*[term for term in terms if term.free_symbols & states]))
         constant = sp.Add(*[term for term in terms if not term.free_symbols & states])
-        form.left_out = constant.xreplace({symbol: part for part, (symbol, _) in symbols.found.items()})
+        form.left_out = constant.xreplace({symbol: part for part, symbol in symbols.found.items()})
         used = form.H.free_symbols - states - {self.time}
-        kept = [(part, *symbol) for part, symbol in symbols.found.items() if symbol[0] in used]
-        form.meanings, form.parameters, form.values = (tuple(row[i] for row in kept) for i in range(3))
+        kept = {symbol: part for part, symbol in symbols.found.items() if symbol in used}
+        try:
+            form.parameters, form.meanings = tuple(kept), tuple(map(_formula, kept.values()))
+        except NotCompiled:
+            return self
+        form.values = tuple(values_of(form.meanings, self.numbers))
         alike = (
             used == {*form.parameters}
             and form.separable == self.separable
@@ -214,6 +215,11 @@ class SymbolicHamiltonian(Definition):
         )
         return form if kept and alike and all(map(math.isfinite, form.values)) else self
 
+    @property
+    def numbers(self) -> dict[str, float]:
+        """The values of the parameters that are numbers."""
+        return {s.name: float(value) for s, value in self.written[1].items() if not isinstance(value, sampled)}
+
     def named(self, names: Sequence[str]) -> SymbolicHamiltonian:
         """H with these parameters as symbols, whatever their values: the form by which it is differentiated by them."""
         key = tuple(names)
@@ -221,11 +227,9 @@ class SymbolicHamiltonian(Definition):
             written, values = self.written
             symbols = {name: sp.Symbol(f"parameter_{i}", real=True) for i, name in enumerate(names)}
             H = written.xreplace({s: symbols.get(s.name, value) for s, value in values.items()})
-            states = {*self.q, *self.p}
-            form = self.like(sp.Add(*[term for term in sp.Add.make_args(H) if term.free_symbols & states]))
-            meanings = [sp.Symbol(name, real=True) for name in names]
-            form.parameters, form.meanings = tuple(symbols.values()), tuple(meanings)
-            form.values = tuple(float(values.get(s, 0.0)) for s in meanings)  # 0 of one that H does not have
+            form = self.like(H)
+            form.parameters = tuple(symbols.values())
+            form.values = tuple(self.numbers.get(name, 0.0) for name in names)  # 0 of one that H does not have
             self._named[key] = form
         return self._named[key]
 
@@ -246,18 +250,8 @@ class SymbolicHamiltonian(Definition):
         if form is self or self.time is not None or self.impulses or form.may_cancel:
             return None
         values = {s: exact(params[s.name]) for s in before}
-        parts, replaced = self.parametric_parts
-        changed = {s for s, value in values.items() if value != before[s]}
-        lasting = [part for part in parts if part not in form.meanings]
-        if changed & replaced or any(part.free_symbols & changed for part in lasting):
-            return None
-        try:
-            numbers = tuple(float(part.xreplace(values)) for part in form.meanings)
-        except (TypeError, OverflowError):  # a value that is not a real number
-            return None
-        if any(not math.isfinite(x) or x in (0, 1, -1) for x in numbers):
-            return None
-        return Revalued(self, form, written, values, numbers)
+        numbers = revalued(*self.parametric_parts, form.meanings, self.numbers, params)
+        return None if numbers is None else Revalued(self, form, written, values, numbers)
 
     @cached_property
     def may_cancel(self) -> bool:
@@ -270,11 +264,14 @@ class SymbolicHamiltonian(Definition):
         return (self.H, {}) if self._written is None else self._written
 
     @cached_property
-    def parametric_parts(self) -> tuple[list[sp.Expr], set[sp.Symbol]]:
-        """Parts of H that are symbols or 0, ±1 in the `parametric` form, and parameters that stay numbers."""
+    def parametric_parts(self) -> tuple[list[Formula], set[str]]:
         symbols = _ParameterSymbols(self.written[1])
         symbols.put_into(self.written[0])
-        return [*symbols.found, *symbols.numbers], symbols.replaced
+        return [*map(_formula, (*symbols.found, *symbols.numbers))], {s.name for s in symbols.replaced}
+
+    @property
+    def source(self) -> sp.Expr:
+        return self.written[0]
 
     @property
     def symbols(self) -> SymbolicHamiltonian:
@@ -650,9 +647,13 @@ def named_time(time: str | sp.Symbol | None, params: Mapping[str, Any]) -> sp.Sy
     name = time.name if isinstance(time, sp.Symbol) else time
     if not isinstance(name, str):
         raise TypeError(f"`time` must be the name of the time in H, such as 't'; got {time!r}.")
-    if not name.isidentifier() or _is_coordinate(name) or name in params or name in FUNCTIONS or name == "pi":
+    if not name.isidentifier() or COORDINATE.fullmatch(name) or name in params or name in FUNCTIONS or name == "pi":
         what = (
-            "a parameter" if name in params else "a coordinate" if _is_coordinate(name) else "not the name of a symbol"
+            "a parameter"
+            if name in params
+            else "a coordinate"
+            if COORDINATE.fullmatch(name)
+            else "not the name of a symbol"
         )
         raise ValueError(f"`time` {name!r} is {what}: name the time otherwise, as time='t'.")
     return sp.Symbol(name, real=True)
@@ -708,7 +709,7 @@ def _read(
 def _valued(H: sp.Expr, values: Mapping[sp.Symbol, sp.Expr], time: sp.Symbol | None) -> sp.Expr:
     """The expression, its parameters replaced by their values."""
     H = with_values(H, values)
-    unknown = sorted(s.name for s in H.free_symbols if not _is_coordinate(s.name) and s != time)
+    unknown = sorted(s.name for s in H.free_symbols if not COORDINATE.fullmatch(s.name) and s != time)
     if functions := sorted(map(str, H.atoms(AppliedUndef))):
         raise TypeError(
             f"`expression` holds {', '.join(functions)}: name what are coordinates, and which momentum belongs to "
@@ -758,12 +759,18 @@ def _check_samples(written: sp.Expr, values: Mapping[sp.Symbol, sp.Expr]) -> Non
             )
 
 
+def _formula(part: sp.Expr) -> Formula:
+    """A part of H that depends on parameters alone, as a program of these."""
+    used = sorted(part.free_symbols, key=str)
+    return Formula(recorded(part, used), [Variable(s.name) for s in used])
+
+
 class _ParameterSymbols:
-    """Symbols for the parts of H that depend on parameters alone, with the values of these parts."""
+    """Symbols for the parts of H that depend on parameters alone."""
 
     def __init__(self, values: Mapping[sp.Symbol, sp.Expr]) -> None:
         self.values = values
-        self.found: dict[sp.Expr, tuple[sp.Symbol, float]] = {}
+        self.found: dict[sp.Expr, sp.Symbol] = {}
         self.numbers: dict[sp.Expr, float] = {}
         self.replaced: set[sp.Symbol] = set()
 
@@ -779,8 +786,8 @@ class _ParameterSymbols:
                 if value in (0, 1, -1):
                     self.numbers[part] = value
                     return number * int(value)
-                self.found[part] = sp.Symbol(f"parameter_{len(self.found)}", real=True), value
-            return number * self.found[part][0]
+                self.found[part] = sp.Symbol(f"parameter_{len(self.found)}", real=True)
+            return number * self.found[part]
         if f.is_Add or f.is_Mul:  # in an order that is the same in each process
             ordered = sorted(f.args, key=sp.default_sort_key)
             coefficient = f.func(*[a for a in f.args if a.free_symbols <= parameters])
@@ -807,38 +814,9 @@ _AMBIGUOUS = {
 """Names that are constants for SymPy, but in the text of a Hamiltonian more likely an energy, a moment of inertia."""
 
 
-def checked_params(params: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Return the parameters as numbers of Python, or samples of a function of t."""
-    if not isinstance(params, Mapping | None):
-        raise TypeError(f"`params` must be a mapping of names to numbers; got {type(params).__name__}: pass a dict.")
-    checked: dict[str, Any] = {}
-    for name, given in (params or {}).items():
-        name = name.name if isinstance(name, sp.Symbol) else name  # noqa: PLW2901
-        if not isinstance(name, str) or _is_coordinate(name) or name == "t":
-            raise ValueError(f"`params` gives a value to {name!r}, which is a coordinate: rename the parameter.")
-        if is_spline(given):
-            checked[name] = Samples.of(name, given)
-            continue
-        check_kept(f"params[{name!r}]", given)
-        value = plain(given)
-        if isinstance(value, numbers.Rational | sp.Expr) and not isinstance(value, int):
-            try:
-                value = float(value)
-            except (TypeError, OverflowError):
-                value = None
-        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= LARGEST:
-            raise ValueError(f"`params` has {name} = {reprlib.repr(given)}: give a finite real number.")
-        checked[name] = value
-    return checked
-
-
-def _is_coordinate(name: str) -> bool:
-    return COORDINATE.fullmatch(name) is not None
-
-
 def _index(symbol: sp.Symbol) -> int:
     """1 for q1, p1, q and p; 2 for q2, p2; …, of very long ones the beginning."""
-    return int(symbol.name[1:20] or 1) if _is_coordinate(symbol.name) else 0
+    return int(symbol.name[1:20] or 1) if COORDINATE.fullmatch(symbol.name) else 0
 
 
 def _with_numeric_constants(H: sp.Expr) -> sp.Expr:

@@ -23,7 +23,9 @@ from sympflow.hamiltonian.fingerprint import fingerprint
 from sympflow.hamiltonian.friction import Friction
 from sympflow.hamiltonian.hamiltonian import Hamiltonian
 from sympflow.hamiltonian.linear_part import checked_damping, checked_inverse_mass, checked_stiffness, numeric
+from sympflow.hamiltonian.parameters import checked_params
 from sympflow.hamiltonian.times import check_period, probe_times
+from sympflow.hamiltonian.written import WrittenHamiltonian, written
 from sympflow.show.cards import Answering, Card, brief, numbers
 
 if TYPE_CHECKING:
@@ -364,14 +366,11 @@ class HamiltonianSystem(Hamiltonian, Answering):
             other than impulses DiracDelta(t − a)·W(q), which are kicks p −= ∇W(q) at the time a; if `damping` is not
             symmetric, has negative rates, or another shape.
         """
-        if isinstance(expression, str) and all(given is None for given in (q, p, params, time)):
-            from sympflow.hamiltonian.written import written
-
-            if (found := written(expression)) is not None:
-                self = cls.__new__(cls)
-                self._make(*found, True, {}, Scene.given(scene), damping, period)
-                return self
-        from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, checked_params, renamed
+        plain = isinstance(expression, str) and all(given is None for given in (q, p, time))
+        checked = checked_params(params) if plain else {}
+        if plain and (found := written(expression, checked)) is not None:
+            return cls._defined(found, found.inverse_mass, checked, Scene.given(scene), damping, period)
+        from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, renamed
 
         if q is not None or p is not None:
             expression = renamed(expression, q, p)
@@ -385,20 +384,23 @@ class HamiltonianSystem(Hamiltonian, Answering):
                 "times as long as by HamiltonianSystem.lattice, from one site and one bond, or by "
                 "HamiltonianSystem.pairs, from one pair. Use one of these."
             )
-        return cls._of_symbols(symbols, params, settled, damping, period)
+        return cls._defined(symbols, symbols.inverse_mass, params, settled, damping, period)
 
     @classmethod
-    def _of_symbols(
+    def _defined(
         cls,
-        symbols: SymbolicHamiltonian,
+        definition: SymbolicHamiltonian | WrittenHamiltonian,
+        M: Any,
         params: Mapping[str, Any],
         scene: Scene,
         damping: float | ArrayLike | None,
         period: float | None = None,
     ) -> HamiltonianSystem:
         self = cls.__new__(cls)
-        M = symbols.inverse_mass
-        self._make(symbols, None if M is None else numeric(M), M is not None, params, scene, damping, period)
+        if isinstance(definition, WrittenHamiltonian):
+            self._make(definition, M, True, params, scene, damping, period)
+        else:
+            self._make(definition, None if M is None else numeric(M), M is not None, params, scene, damping, period)
         return self
 
     @classmethod
@@ -861,7 +863,7 @@ class HamiltonianSystem(Hamiltonian, Answering):
         if self.local is not None:
             self.local.check_numbers(names)
             return
-        if self.symbols is None:
+        if not self.definition.symbolic:
             raise TypeError(
                 f"`params` are for symbolic systems, and {self.name!r} is given by functions, which hold their values: "
                 "make a system for each, or define it with HamiltonianSystem.from_sympy(..., params=...)."
@@ -870,7 +872,7 @@ class HamiltonianSystem(Hamiltonian, Answering):
             raise ValueError(
                 f"`params` of {self.name!r} are those of H and not of its external force: make a system for each value."
             )
-        known = [s.name for s in self.symbols.written[1]]
+        known = [*self.params]
         for name in names:
             if name not in known:
                 has = f"which has {', '.join(known)}" if known else "which has none: write H with symbols for them"
@@ -902,16 +904,13 @@ class HamiltonianSystem(Hamiltonian, Answering):
         """
         if self.local is not None:
             return HamiltonianSystem._of_local(self.local.with_params(values), self.damping, self.scene)
-        from sympflow.hamiltonian.symbolic import checked_params
-
         self.check_parameters(values)
-        H, time = self.symbols.written[0], self.symbols.named_time
-        params = {**self.params, **values}
+        definition, params = self.definition, {**self.params, **values}
         checked = checked_params(params)
-        symbols = self.symbols.revalued(checked)
-        if symbols is not None:
-            return HamiltonianSystem._of_symbols(symbols, checked, self.scene, self.damping)
-        made = HamiltonianSystem.from_sympy(H, params=params, time=time, damping=self.damping, **vars(self.scene))
+        if (found := definition.revalued(checked)) is not None:
+            return HamiltonianSystem._defined(found, found.inverse_mass, checked, self.scene, self.damping)
+        given: dict[str, Any] = {"params": params, "time": definition.named_time, "damping": self.damping}
+        made = HamiltonianSystem.from_sympy(definition.source, **given, **vars(self.scene))
         # Values of the drive may have changed the period: it is tested where it is asked for.
         made._former_period = self.period or self._former_period
         return made

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import ast
+import copy
 import math
-from collections.abc import Sequence
+import unicodedata
+from collections.abc import Mapping, Sequence
 from fractions import Fraction
 from functools import cached_property, reduce
 from operator import mul
-from typing import Any
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -16,8 +19,23 @@ from sympflow.arrays import Array
 from sympflow.compiler.functions import apply
 from sympflow.compiler.program import Program, Recording, Traced, gradient, reached, traced
 from sympflow.hamiltonian.definition import Definition
-from sympflow.hamiltonian.formulas import TracedHamiltonian, TracedPoles, kinetic_matrix
+from sympflow.hamiltonian.formulas import (
+    KINDS,
+    Formula,
+    TracedHamiltonian,
+    TracedPoles,
+    Variable,
+    evaluator,
+    kinetic_matrix,
+    revalued,
+    values_of,
+    without,
+)
 from sympflow.hamiltonian.grammar import COORDINATE, chain, parsed
+from sympflow.hamiltonian.linear_part import simplest
+
+if TYPE_CHECKING:
+    from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 
 FUNCTIONS = {name: name for name in ("sqrt", "exp", "log", "sin", "cos", "tan", "sinh", "cosh", "tanh", "atan")}
 FUNCTIONS["ln"] = "log"
@@ -31,20 +49,25 @@ class NotPlain(Exception):
 
 
 class _Reader:
-    """A text with numbers of a recording: fractions and floats stay such, whatever depends on coordinates is traced."""
+    """A text with numbers of a recording: numbers are fractions, and what depends on names is traced.
 
-    def __init__(self, coordinates: dict[str, Traced]) -> None:
-        self.coordinates = coordinates
+    What depends on `parameters` alone is taken together, and their numerical factors apart.
+    """
+
+    def __init__(self, coordinates: dict[str, Traced], parameters: dict[str, Traced]) -> None:
+        self.names = coordinates | parameters
+        self.parameters = parameters
+        self.fixed = {x.order for x in parameters.values()}
         self.infinite = set[int]()  # the numbers that are infinite somewhere, by what they divide by
 
     def value(self, node: ast.AST) -> Any:
         match node:
             case ast.Constant(value=int() | float() as number) if not isinstance(number, bool):
                 return Fraction(number)
+            case ast.Name(id=name) if name in self.names:
+                return self.names[name]
             case ast.Name(id="pi"):
                 return Fraction(math.pi)
-            case ast.Name(id=name) if name in self.coordinates:
-                return self.coordinates[name]
             case ast.UnaryOp(op=ast.USub()):
                 return self._product([self.value(node.operand), Fraction(-1)])
             case ast.BinOp(op=ast.Add() | ast.Sub()):
@@ -55,28 +78,47 @@ class _Reader:
                 return self._product([self._power(x, Fraction(-1)) if divides else x for x, divides in factors])
             case ast.BinOp(op=ast.Pow()):
                 return self._power(self.value(node.left), self.value(node.right))
-            case ast.Call(func=ast.Name(id=name), args=[argument], keywords=[]) if name in FUNCTIONS:
+            case ast.Call(func=ast.Name(id=name), args=[argument], keywords=[]) if (
+                name in FUNCTIONS.keys() - self.parameters
+            ):
                 return self._call(FUNCTIONS[name], self.value(argument))
         raise NotPlain
 
     def _sum(self, members: Sequence[Any]) -> Any:
         numbers = [x for x in members if isinstance(x, Fraction)]
-        moving = [x for x in members if isinstance(x, Traced)]
-        if not moving:
+        fixed, moving = self._parted(members)
+        if not (fixed or moving):
             return sum(numbers)
+        orders = {x.order for x in (*fixed, *moving)}
+        if any(x.name == "neg" and x.args[0].order in orders for x in (*fixed, *moving)):  # terms that cancel
+            raise NotPlain
         if sum(x.order in self.infinite for x in moving) > 1:  # a difference may have a finite limit
             raise NotPlain
+        constant = [self._marked(sum(fixed[1:], fixed[0]) + float(sum(numbers)), fixed)] if fixed else []
+        if not moving:
+            return constant[0]
         total = self._marked(sum(moving[1:], moving[0]), moving)
-        return total + float(sum(numbers)) if numbers else total
+        return self._marked(total + (constant[0] if fixed else float(sum(numbers))), moving)
 
     def _product(self, factors: Sequence[Any]) -> Any:
         number = reduce(mul, (x for x in factors if isinstance(x, Fraction)), Fraction(1))
-        moving = [x for x in factors if isinstance(x, Traced)]
-        if not moving:
+        fixed, moving = self._parted(factors)
+        if not (fixed or moving):
             return number
+        for i, x in enumerate(fixed):
+            if x.name == "mul" and isinstance(x.args[0], float):
+                number, fixed[i] = number * Fraction(x.args[0]), x.args[1]
+            elif x.name == "neg":
+                number, fixed[i] = -number, x.args[0]
         if len(moving) > 1 and any(x.order in self.infinite for x in moving):  # a quotient may have a finite limit
             raise NotPlain
-        return self._marked(float(number) * reduce(mul, moving), moving)
+        constant = [self._marked(reduce(mul, fixed), fixed)] if fixed else []
+        return self._marked(float(number) * reduce(mul, [*constant, *moving]), [*constant, *moving])
+
+    def _parted(self, members: Sequence[Any]) -> tuple[list[Traced], list[Traced]]:
+        """The members that depend on parameters alone, and those that depend on coordinates."""
+        traced = [x for x in members if isinstance(x, Traced)]
+        return [x for x in traced if x.order in self.fixed], [x for x in traced if x.order not in self.fixed]
 
     def _power(self, base: Any, exponent: Any) -> Any:
         if not isinstance(exponent, Fraction) or abs(exponent) > MOST_POWER:
@@ -86,6 +128,10 @@ class _Reader:
         whole = exponent.denominator == 1
         if isinstance(base, Fraction):
             return base ** int(exponent) if whole else Fraction(float(base) ** float(exponent))
+        if base.order in self.fixed:
+            if base.name == "mul" and whole and isinstance(base.args[0], float):
+                return self._product([Fraction(base.args[0]) ** int(exponent), self._power(base.args[1], exponent)])
+            return self._marked(apply("pow", base, float(exponent)), [base])
         if base.name in ("sqrt", "pow", "div") and not (base.name == "sqrt" and exponent == -1):  # joined by SymPy
             raise NotPlain
         if not whole and base.name not in ("input", "add", "sub"):  # as √x², which is |x|
@@ -100,6 +146,8 @@ class _Reader:
             return Fraction(getattr(math, name)(x))
         if name == "sqrt":
             return self._power(x, Fraction(1, 2))
+        if x.order in self.fixed:
+            return self._marked(apply(name, x), [x])
         known = {each.name for each in reached([x])}
         if x.order in self.infinite or (name == "log" and known - ARITHMETIC) or (name == "exp" and "log" in known):
             raise NotPlain
@@ -108,40 +156,136 @@ class _Reader:
     def _marked(self, x: Any, made_of: Sequence[Traced], infinite: bool = False) -> Any:
         if not isinstance(x, Traced):  # terms that cancel
             raise NotPlain
-        if infinite or any(part.order in self.infinite for part in made_of):
+        if all(part.order in self.fixed for part in made_of):
+            self.fixed.add(x.order)
+        elif infinite or any(part.order in self.infinite for part in made_of):
             self.infinite.add(x.order)
         return x
 
 
-def _form(text: str) -> tuple[TracedHamiltonian, np.ndarray | None]:
-    """The program of H = ½ pᵀM⁻¹p + V(q), a text of few terms."""
+class _Read(NamedTuple):
+    """H of a text in q1 … pd and letters for parts that depend on parameters alone; those that are 0, 1 or −1 in H."""
+
+    ndof: int
+    H: Formula
+    letters: dict[Variable, Formula]
+    lasting: list[Formula]
+
+
+def _read(text: str, params: Mapping[str, float], names: Sequence[str] | None = None) -> _Read:
+    """Read a text; of `names` the letters are these parameters, whatever their values."""
     tree = parsed(text, FUNCTIONS)
-    used = {x.id for x in ast.walk(tree) if isinstance(x, ast.Name) and COORDINATE.fullmatch(x.id)}
-    d = max((int(name[1:] or 1) for name in used), default=0)
-    numbered = all(len(name) > 1 for name in used)
-    if not 0 < d <= MOST_DEGREES or not (numbered or used <= {"q", "p"}):
+    used = {x.id for x in ast.walk(tree) if isinstance(x, ast.Name)}
+    spelled = [unicodedata.normalize("NFKC", name) for name in params]
+    coordinates = {name for name in used if COORDINATE.fullmatch(name)}
+    d = max((int(name[1:] or 1) for name in coordinates), default=0)
+    numbered = all(len(name) > 1 for name in coordinates)
+    if not 0 < d <= MOST_DEGREES or not (numbered or coordinates <= {"q", "p"}) or not used.issuperset(spelled):
         raise NotPlain
     recording = Recording()
-    inputs = [recording.input(f"{letter}{i + 1}") for letter in "qp" for i in range(d)]
-    known = dict(zip(map(repr, inputs) if numbered else "qp", inputs, strict=True))
-    H = _Reader(known).value(tree)
-    _, quadratic, inverse_mass = kinetic_matrix(H, inputs, d)
-    if not quadratic or len(Program(inputs, gradient(H, inputs))) > MOST_OPERATIONS:
+    states = [recording.input(f"{letter}{i + 1}") for letter in "qp" for i in range(d)]
+    own = [recording.input(name) for name in params]
+    known = dict(zip(map(repr, states) if numbered else "qp", states, strict=True))
+    y = _Reader(known, dict(zip(spelled, own, strict=True))).value(tree)
+    within = {x.order for x in reached([y])}
+    if not within.issuperset(x.order for x in own) or any(within.isdisjoint({i, d + i}) for i in range(d)):
         raise NotPlain
+    variables = [Variable(name) for name in (*map(repr, states), *params)]
+    parameters, lasting, found = variables[2 * d :], list[Formula](), dict[Variable, Formula]()
+
+    def value(part: Formula) -> float:
+        (number,) = values_of([part], params)
+        if not math.isfinite(number):
+            raise NotPlain
+        return number
+
+    def fixed(part: Formula) -> float | None:
+        number = value(part)
+        if number not in KINDS:
+            return None
+        lasting.append(part)
+        return number
+
+    H = Formula(Program([*states, *own], [y]), variables)
+    if names is None:
+        return _Read(d, without(H, parameters, found, "parameter", fixed), found, lasting)
+    found = {s: Formula(Program([x], [x]), [s]) for s, x in zip(parameters, own, strict=True) if s.name in names}
+    return _Read(d, without(H, [s for s in parameters if s not in found], {}, "", value), found, lasting)
+
+
+def _lettered(read: _Read, params: Mapping[str, float]) -> TracedHamiltonian:
+    """The form of H = ½ pᵀM⁻¹p + V(q) with its letters as parameters."""
+    (H,), inputs, d = read.H.program.outputs, read.H.program.inputs, read.ndof
+    letters, values = [*read.letters], values_of([*read.letters.values()], params)
+    states, own = inputs[: 2 * d], inputs[2 * d :]
+    _, M = kinetic_matrix(H, states, d, own, values)
+    if M is None or len(Program(inputs, gradient(H, states))) > MOST_OPERATIONS:
+        raise NotPlain
+    rows = [[Formula(Program(own, [x]), letters) if isinstance(x, Traced) else x for x in row] for row in M]
     rest = [0.0] * d
-    V = traced(lambda *q: Program(inputs, [H])(*q, *rest), *map(repr, inputs[:d]))
+    V = traced(lambda *x: read.H.program(*x[:d], *rest, *x[d:]), *map(repr, (*inputs[:d], *own)))
     if not isinstance(V.outputs[0], Traced):
         raise NotPlain
-    return TracedHamiltonian(d, V, True, inverse_mass, text=text), inverse_mass
+    return TracedHamiltonian(d, V, True, rows, parameters=letters, values=values)
+
+
+class TextForm(TracedHamiltonian):
+    """The form of a text, by the values of its parameters; the `parametric` one has letters in their place."""
+
+    def __init__(self, of: WrittenHamiltonian) -> None:
+        lettered, numbers = of.lettered, of.lettered.values
+        V = traced(lambda *q: lettered.program(*q, *numbers), *(s.name for s in lettered.q))
+        super().__init__(of.ndof, V, True, of.inverse_mass)
+        self._of, self.text = of, of.text
+
+    @property
+    def parametric(self) -> TracedHamiltonian:
+        return self._of.lettered if self._of.lettered.parameters else self
+
+    def named(self, names: Sequence[str]) -> TracedHamiltonian:
+        """The form with these parameters as letters, whatever their values."""
+        return _lettered(_read(self._of.text, self._of.params, names), self._of.params)
+
+    @cached_property
+    def written(self) -> SymbolicHamiltonian:
+        from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
+
+        root, own = self._of.root.form, self._of
+        found = None if root is self else root.written.revalued(own.params)
+        return SymbolicHamiltonian(own.text, own.params) if found is None else found
+
+
+class Lettered:
+    """The functions of H with numbers for its letters, and the `meanings` of these."""
+
+    def __init__(self, form: TracedHamiltonian, meanings: Sequence[Formula] = ()) -> None:
+        self.meanings, self.hamiltonian, self.gradient = meanings, form.hamiltonian, form.hamiltonian_gradient
+        self.poles = TracedPoles(form) or None
 
 
 class WrittenHamiltonian(Definition):
     """H = ½ pᵀM⁻¹p + V(q) as a text, by its program; `symbols` are made of the text when they are asked for."""
 
-    separable = has_third_derivative = True
+    separable = has_third_derivative = symbolic = True
+    named_time = None
 
-    def __init__(self, form: TracedHamiltonian) -> None:
-        self.form, self.ndof, self.text = form, form.ndof, form.text
+    def __init__(
+        self,
+        text: str,
+        params: Mapping[str, float],
+        lettered: TracedHamiltonian,
+        meanings: Sequence[Formula],
+        lasting: Sequence[Formula],
+        root: WrittenHamiltonian | None = None,
+    ) -> None:
+        self.text = self.source = text  # type: ignore[misc]
+        self.params, self.lettered, self.ndof = params, lettered, lettered.ndof
+        self._meanings, self._lasting, self.root = tuple(meanings), lasting, self if root is None else root
+        M, d = lettered.inverse_mass, self.ndof
+        assert M is not None
+        known = evaluator(dict(zip(lettered.parameters, lettered.values, strict=True)))
+        self.inverse_mass = simplest(np.array([[known(M[i, j]) for j in range(d)] for i in range(d)], dtype=float))
+        self.form = TextForm(self)
 
     @property
     def name(self) -> str:
@@ -155,7 +299,35 @@ class WrittenHamiltonian(Definition):
     def poles(self) -> Any:
         return self.symbols.poles if TracedPoles(self.form) else None
 
-    _generated = ("poles",)
+    _generated = ("poles", "parametric")
+
+    @cached_property
+    def parametric(self) -> Any:
+        """The functions with numbers for the letters; the definition itself, where it has none."""
+        return Lettered(self.lettered, self._meanings) if self._meanings else self
+
+    @property
+    def meanings(self) -> tuple[Formula, ...]:
+        return self._meanings
+
+    @property
+    def parametric_parts(self) -> tuple[list[Formula], set[str]]:
+        return [*self._meanings, *self._lasting], set()
+
+    def named(self, names: Sequence[str]) -> Lettered:
+        """The functions with numbers for these parameters."""
+        return Lettered(self.form.named(names))
+
+    def revalued(self, params: Mapping[str, float]) -> WrittenHamiltonian | None:
+        """The same H with other values of its parameters; None where it may have another structure."""
+        numbers = revalued(*self.parametric_parts, self._meanings, self.params, params)
+        if numbers is None or not self._meanings:
+            return None
+        lettered = copy.copy(self.lettered)
+        lettered.values = numbers
+        found = WrittenHamiltonian(self.text, params, lettered, self._meanings, self._lasting, self.root)
+        M = np.eye(self.ndof) if found.inverse_mass is None else found.inverse_mass
+        return found if np.linalg.eigvalsh(np.diag(M) if M.ndim == 1 else M)[0] > 0 else None
 
     def potential(self, q: Array) -> Array:
         return self.form.value(q)
@@ -173,10 +345,11 @@ class WrittenHamiltonian(Definition):
         return self.form.third_derivative(q, v, w)
 
 
-def written(text: str) -> tuple[WrittenHamiltonian, np.ndarray | None] | None:
-    """The definition by the program of a text, and M⁻¹; None where the text is left to SymPy."""
+def written(text: str, params: Mapping[str, Any] = MappingProxyType({})) -> WrittenHamiltonian | None:
+    """The definition by the program of a text; None where the text is left to SymPy."""
     try:
-        form, inverse_mass = _form(text)
+        read = _read(text, params)
+        lettered = _lettered(read, params)
     except (NotPlain, ArithmeticError, ValueError, TypeError, RecursionError):
         return None
-    return WrittenHamiltonian(form), inverse_mass
+    return WrittenHamiltonian(text, params, lettered, [*read.letters.values()], read.lasting)

@@ -128,7 +128,7 @@ def note_poles(
     poles, width, n = problem.system.definition.poles, 2 * problem.system.ndof, len(outcome.t)
     numbers: Sequence[Any] = ()
     if problem.parameter_values is not None:
-        poles, numbers = problem.system.symbols.parametric.poles, [*problem.parameter_values]
+        poles, numbers = problem.system.definition.parametric.poles, [*problem.parameter_values]
     if not poles or not n:
         return []
     starts = to_numpy(problem.y0).reshape(-1, width)
@@ -141,7 +141,7 @@ def note_poles(
         t = np.concatenate([[problem.t0], outcome.t[every][::-1]])
         try:
             looked = _look(problem.system, poles.look(y, t[:, None], numbers))
-            if looked is not None and (exact := poles.exact) is not poles:
+            if looked is not None and not numbers and (exact := poles.exact) is not poles:
                 looked = _look(problem.system, exact.look(y, t[:, None])) if exact else None
         except TypeError:  # a function that takes no arrays
             return []
@@ -408,8 +408,7 @@ def _energy_off(outcome: Outcome, problem: Problem, seen: int, most: float, each
     functions: Any = system
     numbers: dict[str, Any] = {}
     if problem.parameter_values is not None:
-        assert system.symbols is not None
-        functions, numbers = system.symbols.parametric, {"numbers": problem.parameter_values[:, :LOOKED_AT]}
+        functions, numbers = system.definition.parametric, {"numbers": problem.parameter_values[:, :LOOKED_AT]}
     with np.errstate(all="ignore"):
         try:
             H = np.asarray(functions.hamiltonian(y, **numbers))

@@ -106,8 +106,8 @@ def check_params(
 
 def check_own_parameters(system: HamiltonianSystem, values: Mapping[str, ArrayLike], integrator: Integrator) -> None:
     """Refuse a trained flow for other parameters than its system's, and a sweep from where H is constant in time."""
-    symbols = system.symbols if values else None
-    if symbols is not None and symbols.time is not symbols.named_time:
+    definition = system.definition
+    if values and definition.symbolic and not definition.timed and definition.named_time is not None:
         raise ValueError(
             "`params` would make H depend on t, but with the values of `system` it does not: pass a system whose H "
             "depends on t, as by system.with_params(...)."

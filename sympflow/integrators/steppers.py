@@ -78,7 +78,7 @@ class Stepper:
         if untraced and problem.backend == "auto" and y0.dtype == np.float64:
             name = "potential" if problem.system.separable else "hamiltonian"
             self.why = f": `{name}` could not be traced, because {untraced}"
-        if told and problem.system.symbols is not None:
+        if told and problem.system.definition.symbolic:
             self.remark = f" Its steps were array operations: {_ADVICE.sub('.', told[0])}"
         elif told and problem.system.form is not None:  # functions that were traced
             self.why = f": {_ADVICE.sub('', told[0])}"

@@ -37,10 +37,10 @@ def splitting_loops(system: HamiltonianSystem, names: tuple[str, ...] = ()) -> S
 
 
 def _traced_form(system: HamiltonianSystem, names: tuple[str, ...]) -> Any:
-    """The program of functions, with entries of M⁻¹ of these names as parameters where torch follows the mass."""
-    if system.followed_mass is None or not names:
+    """The program of functions, with parameters of these names, or entries of M⁻¹ where torch follows the mass."""
+    if not names:
         return system.form
-    if system.friction:
+    if system.followed_mass is not None and system.friction:
         raise arrays_only(f"`system` {system.name!r} has friction, and a mass that torch follows")
     return system.definition.form.named(names)
 
@@ -106,7 +106,7 @@ class SplittingLoops:
             check_size(form)
             check_damping(system, False)
             self._has_force_gradient = self.traced = True
-            self._form, self.values, V = form, form.values, form.V
+            self._form, self.values, V = form, form.parametric.values, form.V
             self.abreast = LANES_OF_SUMS if V is not None and V.is_polynomial() and not self.driven else LANES
             self._has_ranges = form.text is not None and self.ndof == 1 and not form.V.is_polynomial()
             if self.driven:

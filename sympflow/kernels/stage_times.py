@@ -18,8 +18,9 @@ import sympy as sp
 from sympflow.compiler import NotCompiled
 from sympflow.compiler.functions import apply, where
 from sympflow.compiler.tables import Table
-from sympflow.hamiltonian.driving import DURATION, Samples, drift, with_symbols
+from sympflow.hamiltonian.driving import DURATION, drift, with_symbols
 from sympflow.hamiltonian.formulas import evaluator, recorded
+from sympflow.hamiltonian.parameters import Samples
 from sympflow.hamiltonian.recorded import check_recorded
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 

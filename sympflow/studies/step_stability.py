@@ -258,7 +258,7 @@ class Study:
     @property
     def compiled(self) -> bool:
         system = self.system
-        known = system.symbols is not None or system.numba_functions is not None or self.integrator.trained
+        known = system.definition.symbolic or system.numba_functions is not None or self.integrator.trained
         return self.integrator.compiles and self.dtype == "float64" and known
 
     @property

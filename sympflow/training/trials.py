@@ -71,7 +71,7 @@ class Trial:
 
 def can_try(system: HamiltonianSystem) -> bool:
     """Return whether trials apply to a system."""
-    return system.separable and system.quadratic_kinetic and system.symbols is not None and system.ndof <= MOST_NDOF
+    return system.separable and system.quadratic_kinetic and system.definition.symbolic and system.ndof <= MOST_NDOF
 
 
 def chosen_trial(system: HamiltonianSystem, domain: Domain, session: Session | None = None) -> Trial:
