@@ -244,7 +244,7 @@ class TextForm(TracedHamiltonian):
 
     def named(self, names: Sequence[str]) -> TracedHamiltonian:
         """The form with these parameters as letters, whatever their values."""
-        return _lettered(_read(self._of.text, self._of.params, names), self._of.params)
+        return _lettered(_read(self._of.source, self._of.params, names), self._of.params)
 
     @cached_property
     def written(self) -> SymbolicHamiltonian:
@@ -278,7 +278,7 @@ class WrittenHamiltonian(Definition):
         lasting: Sequence[Formula],
         root: WrittenHamiltonian | None = None,
     ) -> None:
-        self.text = self.source = text  # type: ignore[misc]
+        self.text = self.source = text
         self.params, self.lettered, self.ndof = params, lettered, lettered.ndof
         self._meanings, self._lasting, self.root = tuple(meanings), lasting, self if root is None else root
         M, d = lettered.inverse_mass, self.ndof
@@ -325,7 +325,7 @@ class WrittenHamiltonian(Definition):
             return None
         lettered = copy.copy(self.lettered)
         lettered.values = numbers
-        found = WrittenHamiltonian(self.text, params, lettered, self._meanings, self._lasting, self.root)
+        found = WrittenHamiltonian(self.source, params, lettered, self._meanings, self._lasting, self.root)
         M = np.eye(self.ndof) if found.inverse_mass is None else found.inverse_mass
         return found if np.linalg.eigvalsh(np.diag(M) if M.ndim == 1 else M)[0] > 0 else None
 
