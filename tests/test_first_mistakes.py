@@ -108,6 +108,7 @@ ANSWERED = {
     "q_1": (lambda: H("p_1**2/2 + q_1**2/2"), "q1 … qd and p1 … pd: other names .* q="),
     "q0": (lambda: H("p0**2/2 + q0**2/2"), "q1 … qd and p1 … pd: other names .* q="),
     "uneven names": (lambda: H("p**2/2", q=["q"], p=["p", "r"]), "`q` and `p` must name d"),
+    "verlet,srkn11b": (lambda: sympflow.get("verlet,srkn11b"), "names several: one method .*`compare` takes several"),
     "yoshida": (lambda: sympflow.get("yoshida"), "'yoshida4' or 'yoshida6'"),
     "ruth3": (lambda: sympflow.get("ruth3"), "'yoshida4'"),
     "whfast": (lambda: sympflow.get("whfast"), "'wisdom_holman'"),

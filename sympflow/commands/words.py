@@ -252,6 +252,7 @@ MEANT = {  # options by the names that users try
     **dict.fromkeys(("t0", "start"), "t-start"),
     **dict.fromkeys(("q0", "p0", "x0", "q", "p", "initial", "ic"), "y0"),
     **dict.fromkeys(("output", "save", "plot", "file", "csv", "o"), "out"),
+    **dict.fromkeys(("budget", "timeout", "max_time"), "time-budget"),
 }
 OF_METHODS = (
     "rtol",

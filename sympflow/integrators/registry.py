@@ -114,6 +114,8 @@ def get(method: str | type[Integrator]) -> type[Integrator]:
         return get(name)
     if name in SYNONYMS:
         return get(SYNONYMS[name])
+    if "," in method:
+        raise ValueError(f"`method` {method!r} names several: one method runs at a time, and `compare` takes several.")
     instead = f" {ABSENT[name]}" if name in ABSENT else did_you_mean(name, [*available(), *SYNONYMS])
     rows = "".join(f"\n  {kind:42}{', '.join(map(repr, names))}" for kind, names in KINDS.items())
     raise ValueError(

@@ -140,6 +140,7 @@ def test_missing_matplotlib_is_reported_before_anything_is_computed(command, tmp
     [
         (["compare", "henon-hiles"], "Did you mean 'henon-heiles'"),
         (["compare", "henon-heiles", "--omega", "1"], "`--omega` is neither an option nor a parameter of henon-heiles"),
+        (["train", "pendulum", "--budget", "2"], "did you mean --time-budget"),
         (["compare", "henon-heiles", "--t-ned", "1"], "`--t-ned` is neither an option nor a parameter"),
         (["compare", "harmonic-oscillator", "--omega", "fast"], "`--omega` must be a number"),
         (["compare", "harmonic-oscillator:mass=2"], "`mass` is not a parameter of harmonic-oscillator"),
