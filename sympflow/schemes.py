@@ -97,14 +97,14 @@ class Scheme:
     order : int or None
         Classical order of convergence; None where nothing is claimed (a trained table).
     kicks, drifts, gradients : tuple of float
-        Coefficients b, a and g of the stages in their order of execution; zeros cost nothing. No g means none but
-        zeros. Other sequences of numbers become tuples.
+        Coefficients b, a and g of the stages in their order of execution; zeros cost nothing. Without g all are zero.
+        Other sequences of numbers become tuples.
     curvatures : tuple of float
-        Coefficients c, none for none.
+        Coefficients c; empty if all are zero.
     polynomials : tuple of tuple of float
-        Coefficients e of each stage, none for none; then there are neither g nor c.
+        Coefficients e of each stage; empty if there are none. With them there are neither g nor c.
     monomials : tuple of tuple of int
-        The exponents m of these.
+        The exponents m of the monomials of the polynomials.
     source : str
         Where the coefficients come from.
     nystrom : bool
@@ -170,7 +170,7 @@ class Scheme:
 
     @cached_property
     def substeps(self) -> tuple[Substep, ...]:
-        """The maps really executed: no zeros, like neighbours merged."""
+        """The maps that are executed: without zeros, and neighbours of the same kind merged."""
         merged: list[Substep] = []
         n = len(self.kicks)
         columns = self.curvatures or (0.0,) * n, self.polynomials or ((),) * n
@@ -183,7 +183,7 @@ class Scheme:
 
     @cached_property
     def substep_times(self) -> tuple[float, ...]:
-        """When each of the substeps begins, in steps: time moves with the drifts."""
+        """The time at which each substep begins, in units of the step: time moves with the drifts."""
         times, t = [], 0.0
         for substep in self.substeps:
             times.append(t)
@@ -229,7 +229,7 @@ class Scheme:
 
     @cached_property
     def counts(self) -> dict[str, tuple[int, int, int]]:
-        """Evaluations of a step in a long run, of a step alone, and of the last kick where the next step shares it."""
+        """Evaluations of a step in a long run, of a single step, and of the last kick if the next step shares it."""
         kicks = [s for s in self.substeps if s.kind == "kick"]
         shared = self.first_same_as_last and self.substeps[0].kind == "kick"
         found: dict[str, tuple[int, int, int]] = {}
@@ -245,7 +245,7 @@ class Scheme:
 
     @cached_property
     def strang_weights(self) -> tuple[float, ...] | None:
-        """The lengths of the Strang steps that the scheme is composed of; None if it is not."""
+        """The lengths of the Strang steps of which the scheme is composed; None if it is not a composition of these."""
         kinds = [s.kind for s in self.substeps]
         inner = kinds[1] if len(kinds) > 2 and len(kinds) % 2 else ""
         weights = tuple(s.one for s in self.substeps if s.kind == inner)

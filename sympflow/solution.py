@@ -51,25 +51,25 @@ class Solution(Answering):
     sol : callable or None
         Dense output: sol(t) has shape (..., 2d) for a number t, (..., 2d, n) for an array.
     t_events, y_events : list of ndarray or None
-        For each event its times (n,) and states (n, 2d), without gradient (`interop.torchdiffeq.odeint_event` gives
-        that); None if no events were asked for.
+        For each event its times (n,) and states (n, 2d), without gradients (see `interop.torchdiffeq.odeint_event`);
+        None without `events`.
     nfev : int
         Force (right-hand side) evaluations.
     status : int, or ndarray of the batch's shape
         0: the end was reached, or the last time of `t_eval`. −1: the solution became non-finite, an implicit step could
-        not be solved, the step size underflowed, or the steps were too many. 1: an event ended it.
+        not be solved, the step size underflowed, or there were too many steps. 1: an event ended the run.
     message : str
-        In words, with the time and the remedy.
+        The status in words, with the time and the remedy.
     stats : dict
         n_steps, force_evaluations, hessian_evaluations, wall_time (seconds), backend, and dt for fixed steps; where
         a run failed, failed_at, the time of its last finite state, and where its solution becomes infinite
         blow_up_time, an estimate (in a batch arrays, NaN for the others;
         with `params`, of the first 16 sets of values that fail); newton_iterations of implicit methods.
     system, integrator, t_span, y0
-        The problem that was solved and the method that did it: metrics execute the run again from these.
+        The problem that was solved, and its method: metrics execute the run again from these.
     rows : ParameterRows or None
         The parameters of each trajectory, where `solve` was given `params`: see `params` and `by_parameters`. `system`
-        is then the one that was given, unless they were given as numbers.
+        is then the argument of `solve`, unless all values are numbers.
     """
 
     _OTHER_NAMES: ClassVar[Mapping[str, str]] = {
@@ -132,7 +132,7 @@ class Solution(Answering):
 
     @property
     def params(self) -> dict[str, Any]:
-        """The values of the parameters by their names: numbers, and arrays (...) of those that `solve` was given."""
+        """The values of the parameters by name: numbers, and arrays (...) for those given to `solve`."""
         return {**self.system.params, **({} if self.rows is None else self.rows.values)}
 
     @property
@@ -169,10 +169,11 @@ class Solution(Answering):
             )
 
     def physical(self) -> Solution:
-        """The solution of the physical system, of a solution of a doubled one (`sympflow.doubled`).
+        """The solution of the physical system, from that of a doubled one (`sympflow.doubled`).
 
         Its states are [q₊, p₊], its system the one with friction and the external force, and `stats["difference"]` is
-        the largest |q₋| or |p₋| of the run, 0 in the physical limit. Metrics of what is not kept refuse it.
+        the largest |q₋| or |p₋| of the run, 0 in the physical limit. Metrics of quantities that are not conserved
+        refuse it.
 
         Raises
         ------
@@ -187,7 +188,7 @@ class Solution(Answering):
         return physical_solution(self)
 
     def energy(self) -> Array:
-        """H along the solution, of a driven system at the times of its states: (..., n)."""
+        """H along the solution: (..., n); for a driven system at the times of the states."""
         with np.errstate(all="ignore"):
             if self.varied and not is_tensor(self.y):
                 return _energy(self, self.states, self.t)
@@ -196,7 +197,7 @@ class Solution(Answering):
             return self.system.hamiltonian(self.states, np.broadcast_to(self.t, self.states.shape[:-1]))
 
     def energy_error(self) -> np.ndarray:
-        """Relative energy error over time, (..., n), with its sign; inf where H is beyond floats.
+        """Relative energy error over time, (..., n), with its sign; inf where H overflows.
 
         See `sympflow.energy_error`; the largest magnitude is `sympflow.max_energy_error(sol)`.
         """
@@ -250,7 +251,8 @@ class Solution(Answering):
         ----------
         kinds : sequence of str
             Of "orbit", q₁ against q₂ (q over t of one degree of freedom, a map of all q of many), "phase", q₁ against
-            p₁, of bodies their orbits and x against pₓ/m, and "energy", which is left out where energy is not kept.
+            p₁, for bodies their orbits and x against pₓ/m, and "energy", which is left out where energy is not
+            conserved.
         """
         from sympflow.hamiltonian.bodies import PairsHamiltonian
 
@@ -272,7 +274,7 @@ class Solution(Answering):
         )
 
     def to_scipy(self) -> OptimizeResult:
-        """The `OdeResult` that `scipy.integrate.solve_ivp` would have returned; of a single trajectory.
+        """The `OdeResult` that `scipy.integrate.solve_ivp` would have returned; for a single trajectory.
 
         Raises
         ------
@@ -305,13 +307,13 @@ class Solution(Answering):
         Variables are `q` and `p` with the dimensions (..., dof, time), `energy` (..., time), the initial states `q0`
         and `p0` (..., dof), `status` (...), and of each event i its times `t_event_i` and states. A batch has the
         dimension `orbit`, or of more axes orbit_0, orbit_1, ...; parameters that were given for each trajectory are
-        coordinates along it. The attributes say by what the data were made: the version of sympflow, the system, its
-        H and params, the method, its options, the checksum of its flow, counts of the run, and the message.
+        coordinates along it. The attributes describe how the data were made: the version of sympflow, the system, its H
+        and params, the method, its options, the checksum of its flow, counts of the run, and the message.
 
         Parameters
         ----------
         energy : bool
-            False leaves `energy` out, which is an evaluation of H at each state.
+            False leaves `energy` out, which costs an evaluation of H at each state.
 
         Raises
         ------

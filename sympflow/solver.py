@@ -105,8 +105,8 @@ def solve(
         default one that suits the system, the first of these that applies: a flow that ships for it ("sympflow");
         "wisdom_holman" for planets about a star; "log_kahan_li8" where V < 0 falls without bound towards a place, or,
         without `tol`, "dop853" where it does so as a logarithm or is positive elsewhere; "srkn11b" where T = ½ pᵀM⁻¹p;
-        "kahan_li8" where H is separable; "gauss_legendre6"; "dop853". The message and `stats["chosen"]` say which, and
-        why.
+        "kahan_li8" where H is separable; "gauss_legendre6"; "dop853". The message and `stats["chosen"]` contain the
+        choice and its reason.
     t_span : (float, float), optional
         Start and end; the end may lie before the start. The default is the system's. Gradients flow to tensors, here
         and in `t_eval`, by the field at the start and at the outputs. With a terminal event the end may
@@ -115,12 +115,12 @@ def solve(
         Initial state [q, p], or a batch of them. The default is the system's. A NumPy array gives float64 (integers are
         promoted); a tensor gives a tensor of its dtype and device, and gradients flow to it.
     tol : float, optional
-        The largest relative energy error that is asked for; on the logarithmic clock, which may keep H where the time
-        is wrong, the error of states. A method of fixed steps takes the step that `sympflow.choose_step` finds by short
-        trial runs; for "sympflow" it chooses the flow, see its option. The error of the run itself is in `stats`,
-        "energy_error" or "state_error": where it is larger, a RuntimeWarning and the message say so. That of states
-        is found by another run with half of the step; with friction or a drive the energy is balanced with the work,
-        which is that of runs with half of the step from one output to the next.
+        The largest relative energy error; on the logarithmic clock, where H may be conserved although the time is
+        wrong, the largest error of states. A method of fixed steps takes the step that `sympflow.choose_step` finds by
+        short trial runs; for "sympflow" it chooses the flow. The error of the run itself is in `stats`, "energy_error"
+        or "state_error": where it is larger than `tol`, a RuntimeWarning and the message report it. The error of states
+        is found by another run with half of the step; with friction or a drive the error is that of the balance of
+        energy and work, from runs with half of the step from one output to the next.
     tol_of : {"energy", "state"}
         See `sympflow.choose_step`.
     params : mapping of str to array_like, optional
@@ -128,8 +128,8 @@ def solve(
         of one state y0 they make a batch. The others keep the system's values. Splitting methods on the splitting
         "kinetic" take them as numbers of one compiled run, and each trajectory is that of a batch on
         ``system.with_params(...)``, up to rounding with compensated sums, force gradients, friction or a drive.
-        Otherwise trajectories are grouped by parameter values, and the groups run in sequence. A trained flow holds for
-        its own parameters alone. Gradients flow to tensors that require them, by splitting methods on the splitting
+        Otherwise trajectories are grouped by parameter values, and the groups run in sequence. A trained flow is valid
+        for its own parameters only. Gradients flow to tensors that require them, by splitting methods on the splitting
         "kinetic", and where H does not depend on t by Gauss methods and Runge–Kutta methods of fixed steps.
     t_eval : array_like of shape (n,), optional
         Times to report, ordered from start to end. The default is every step. No other state is stored.
@@ -147,28 +147,28 @@ def solve(
     event_step : float, optional
         Longest time between two samples of the event functions; two zeros of the same function between two samples are
         missed. It never changes the run: longer steps are sampled within, by the dense output, as `max_step` does
-        inside `solve_ivp`. The default is `system.dt` for fixed steps, which may be long, and every step for adaptive
+        inside `solve_ivp`. The default is `system.dt` for fixed steps, which may be long, and each step for adaptive
         methods.
     backend : "auto", "compiled" or "array"
         "auto" runs symbolic systems, lattices, pairs and Numba functions compiled, for float64 NumPy states and, by
         methods of fixed steps, for tensors on the CPU; everything else with array operations, tensors on a GPU too.
-        What ran is in `stats["backend"]`.
+        The choice is in `stats["backend"]`.
     on_domain_exit : "warn", "stop" or "ignore", optional
-        What to do when an output lies outside the domain Ω: "warn" puts the first exit into the message and the
-        statistics, "stop" ends there with status −1 (in a batch for that trajectory alone, NaN from there on). The
-        default is "warn" for trained flows, whose figures hold in Ω, and "ignore" for classical methods.
+        Action when an output lies outside the domain Ω: "warn" puts the first exit into the message and the statistics,
+        "stop" ends the run there with status −1 (in a batch only that trajectory, NaN from there on). The default is
+        "warn" for trained flows, whose accuracy is known in Ω only, and "ignore" for classical methods.
     diagnose : bool
-        True to look at the run when it is over: for places where H is infinite that it passed, for steps that are too
-        long, and, where it becomes non-finite, if the solution itself does, and when: a tenth of a second or so.
+        True to check the finished run: for places where H is infinite, for steps that are too long, and, if it became
+        non-finite, whether and when the solution itself does. This takes about a tenth of a second.
     progress : bool or callable
-        True for a bar on stderr; or a function of the time that is done and of the total, called a few times a second.
-        A method that is not run in windows, such as that of a library, reports its end only.
+        True for a bar on stderr; or a function of the elapsed and the total time of the run, called a few times a
+        second. Methods of other libraries, which do not run in windows, report only the end.
     store : path, optional
         A folder, a zarr store, into which outputs are written as they are computed: fixed steps, NumPy states. Memory
-        does not grow with them: `t` and `y` of the solution are read from the store when they are asked for, and
+        does not grow with them: `t` and `y` of the solution are read from the store when they are used, and
         ``xarray.open_zarr(store)`` reads it at any time.
     resume : bool
-        Go on with the run that is in the store, if there is one: after a kill at any moment, or to a later end of
+        Continue the run in the store, if there is one: after a kill at any moment, or to a later end of
         `t_span`, with later times in `t_eval`, the result equals that of an uninterrupted run bit for bit. A store of
         another run is refused: runs are compared by everything that defines them, functions and classes by their code
         and the values that they use.
@@ -176,7 +176,8 @@ def solve(
         With `resume`, assume that functions and Python objects are those of the store. Use it where they cannot be
         compared, such as results of a compiled library, or where code was rewritten with the same meaning.
     checkpoint_every : float, optional
-        Seconds of work, at most, that a kill loses; the default is 10. Outputs are chosen by `t_eval` and `save_every`.
+        Time between checkpoints in seconds: the most work that is lost when the process is killed; the default is 10.
+        Outputs are chosen by `t_eval` and `save_every`.
     **options
         Options of the method: `dt` for fixed steps (default `system.dt`, or the flow's Δt), `rtol` and `atol` for
         adaptive ones, `flow` for "sympflow" and "mlp".
@@ -194,7 +195,7 @@ def solve(
     RuntimeError
         If the method is that of a plug-in and fails: the message names the plug-in.
     Interrupted
-        A KeyboardInterrupt, by Ctrl-C in a run of a second or more: its `solution` is what was computed until then.
+        A KeyboardInterrupt, by Ctrl-C in a run of a second or more: its `solution` has the outputs computed until then.
 
     Examples
     --------

@@ -203,10 +203,10 @@ def choose_step(
     t_span: tuple[float, float] | None = None,
     tol_of: str = "energy",
 ) -> float:
-    """Return the longest step, within a factor of about two, that lets a fixed-step method meet a tolerance.
+    """Return the longest step, within a factor of about two, for which a fixed-step method meets a tolerance.
 
-    It is found by a few short runs from the given states: of 4096 steps, and over 400 times `system.dt` at least, or
-    over the whole of `t_span` where that is shorter.
+    It is found by a few short runs from the given states: of 4096 steps and at least 400 times `system.dt`, or of the
+    whole of `t_span` where that is shorter.
 
     Parameters
     ----------
@@ -216,9 +216,9 @@ def choose_step(
     tol : float
         The largest error: |H − H₀| relative to the `energy_scale` of `sympflow.metrics.energy`. Where H is not
         conserved, with friction or a drive, the error of the balance of energy and work takes its place: the sum of
-        the differences of H from short runs with half of the step, each from a state of the run. Where H is kept
-        whatever the step, as by Gauss methods on a quadratic H, and for the methods on the logarithmic clock, the error
-        is that of the states; also of a driven H that jumps in t.
+        the differences of H from short runs with half of the step, each from a state of the run. Where H is conserved
+        for every step, as by Gauss methods on a quadratic H, for the methods on the logarithmic clock, and for a driven
+        H that jumps in t, the error is that of the states.
     y0 : array_like of shape (..., 2d), optional
         Initial states, by default the system's.
     t_span : (float, float), optional
@@ -234,7 +234,7 @@ def choose_step(
     Raises
     ------
     ValueError, TypeError
-        If an argument is wrong, the method has no steps to choose, or `tol` is below what rounding allows.
+        If an argument is wrong, the method has no fixed steps, or `tol` is below what rounding allows.
 
     Examples
     --------

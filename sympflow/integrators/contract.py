@@ -103,12 +103,13 @@ class Failure(Enum):
 
 
 class Interrupted(KeyboardInterrupt):
-    """Ctrl-C during a long run, with what was computed until then.
+    """Ctrl-C during a long run, with the outputs computed until then.
 
     Attributes
     ----------
     solution : Solution
-        The outputs up to where the run was, with status −1, the time in the message and in `stats["interrupted_at"]`.
+        The outputs up to the interruption, with status −1, and its time in the message and in
+        `stats["interrupted_at"]`.
     """
 
     def __init__(self, outcome: Outcome, solution: Any = None) -> None:

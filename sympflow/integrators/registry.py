@@ -75,12 +75,12 @@ _loaded: dict[type[Integrator], EntryPoint] = {}
 
 
 def available() -> list[str]:
-    """The names of all methods: built in, registered, and from plug-ins. Nothing is imported to list them."""
+    """The names of all methods: built in, registered, and from plug-ins, which are not imported for that."""
     return sorted({*NAMES, *_registered, *_plugins()})
 
 
 def get(method: str | type[Integrator]) -> type[Integrator]:
-    """The integrator class of a name; call it with its options: ``get("verlet")(dt=0.05)``.
+    """The integrator class with a name; call it with its options: ``get("verlet")(dt=0.05)``.
 
     Parameters
     ----------

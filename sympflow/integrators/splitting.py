@@ -472,8 +472,8 @@ def splitting_method(
     splitting, clock : str
         The defaults of the options of these names: see `Splitting`.
     name : str, optional
-        By which reports call the method. The default is that of the triple if it is a built-in one, else the scheme's,
-        with the splitting and the clock where they are not "kinetic" and "physical".
+        The name of the method in reports. By default that of a built-in triple, else that of the scheme, followed by
+        the splitting and the clock if these are not "kinetic" and "physical".
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""sympflow where people already work: `interop.scipy`, `.torchdiffeq`, `.torchode`, and `.systems` for conversion.
+"""sympflow inside other libraries: `interop.scipy`, `.torchdiffeq`, `.torchode`, and `.systems` for conversion.
 
 Each is imported when it is first used.
 """

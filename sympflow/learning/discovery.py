@@ -284,40 +284,42 @@ def discover(
 ) -> DiscoveredSystem:
     """Find a sparse H(q, p) = Σ θ_k f_k(q, p) behind trajectories, or behind a trained flow.
 
-    Constants in H are left out, which move nothing. A dimensionless H of data in other units is that of these units.
+    H has no constant term. It is in the units of the data.
 
     Parameters
     ----------
     data : FlowMap, or anything that `Trajectories.read` takes
-        Of a flow its Hamiltonian 𝓗(ψ̄)(t, x) is used, averaged over t ∈ [0, Δt].
+        For a flow its Hamiltonian 𝓗(ψ̄)(t, x) is used, averaged over t ∈ [0, Δt].
     terms : str, sympy.Expr or sequence of these, optional
         The library: expressions in q1 … qd, p1 … pd, and the names "polynomials", "trigonometric", "distances"; all
-        of the latter by default. Of three or more degrees of freedom polynomials are of each, and of pairs.
+        three by default. For three or more degrees of freedom polynomials depend on one or two of these.
     ndof : int, optional
     degree : int
         The highest degree of polynomials.
     noise : float or array_like of shape (2d,), optional
-        The standard deviation of the noise of each coordinate; else it is estimated.
+        The standard deviation of the noise of each coordinate; by default it is estimated.
     held_out : float
-        Share of trajectories that no model is fitted to until one is chosen; 0 for none.
+        Share of trajectories that are held out of the fits until a model is chosen; 0 for none.
     piece : float, optional
-        The longest time that is shot through from one latent state: for chaotic data a Lyapunov time or two. The
-        default is about one period.
+        The longest time of a shooting segment, integrated from one latent state: for chaotic data one or two Lyapunov
+        times. The default is about one period.
     loss : {"squares", "huber"}
         "huber" for data with outliers.
     most_terms : int
         The most terms of a model.
     domain : Domain, optional
-        Where a flow's Hamiltonian is looked at; the default is the flow's own. Of the system that is made: the
-        default is a box around the data, or a tube around one trajectory where they do not tell H beyond it.
+        For a flow: where its Hamiltonian is evaluated; the default is its own domain. For data: the domain of the
+        system that is returned; the default is a box around the data, or a tube around one trajectory where the data
+        determine H only near it.
     seed : int
-        Of the trajectories that are held out.
+        Seed of the choice of the held-out trajectories.
     name : str
         Of the system.
     time_budget : float, optional
         Seconds, after which the best model so far is taken; Ctrl-C ends the search likewise.
     progress : bool or callable, optional
-        True to show the models on the way, by default on a terminal; or a function of a line for each.
+        True to print each model that is tried, as by default on a terminal; or a function that is called with each
+        line.
     **reading
         Options of `Trajectories.read`, such as `units` and `order`.
 
@@ -325,16 +327,15 @@ def discover(
     -------
     DiscoveredSystem
         An ordinary system, to be solved and trained on; `system.discovery` has the coefficients with their standard
-        errors, the noise, and the path of models with its figure.
+        errors, the noise, and the models that were tried, with a figure.
 
     Warns
     -----
     UserWarning
-        If no model explains the data: its residuals are larger than their noise. The message says by how much, and
-        what the data rather look like: friction, velocities in place of momenta, columns in another order. If a
-        function of the coordinates is the same at all points of the data, as on circular orbits of one radius: any
-        function of it may be added to H. If the noise
-        that was given is much larger than the residuals. If the time budget ended the search.
+        If the residuals of all models are larger than the noise: the message says by how much, and the likely reason,
+        such as friction, velocities in place of momenta, or columns in another order. If a function of the coordinates
+        is constant on the data, as on circular orbits of one radius: any function of it may be added to H. If the given
+        noise is much larger than the residuals. If the time budget ended the search.
 
     Raises
     ------
@@ -344,7 +345,7 @@ def discover(
     References
     ----------
     .. [1] S. L. Brunton, J. L. Proctor, J. N. Kutz, Discovering governing equations from data by sparse identification
-       of nonlinear dynamical systems, PNAS 113 (2016) 3932–3937, for the regression that comes first.
+       of nonlinear dynamical systems, PNAS 113 (2016) 3932–3937, for the first regression.
     .. [2] J. Chen, Z. Chen, Extended Bayesian information criteria for model selection with large model spaces,
        Biometrika 95 (2008) 759–771.
     """

@@ -64,21 +64,21 @@ def learn(
 ) -> Any:
     """Learn a flow map from trajectories of a system whose H is not known.
 
-    First H is learned: models of several families, from simple to rich, are fitted by shooting, with the initial state
-    of every trajectory, and trajectories that were held out choose among them. Then a flow of that H is trained. All
-    noise is taken for independent and normal, of one size for each coordinate.
+    First H is learned: models of several families, from simple to rich, are fitted by shooting, together with the
+    initial state of every trajectory, and the best on held-out trajectories is chosen. Then a flow of that H is
+    trained. The noise is assumed to be independent and normal, with one standard deviation for each coordinate.
 
     Parameters
     ----------
     trajectories
         A list of (t, y), t (n,) and y (2d, n), each with its own times; a pair of arrays t (n,) and y (N, 2d, n); or
-        any data that `sympflow.learning.trajectories.Trajectories.read` takes. NaN is what is missing. A fifth of the
-        trajectories is held out, three at least; of fewer than eight each is left out in turn, or in one of three
-        parts. A trajectory that is the only one is cut into pieces, of which some are held out.
+        any data that `sympflow.learning.trajectories.Trajectories.read` takes. NaN marks missing values. A fifth of the
+        trajectories is held out, at least three; with fewer than eight, cross-validation is used. A single trajectory
+        is cut into pieces, and some of these are held out.
     ndof : int, optional
         Degrees of freedom d.
     dt : float, optional
-        Δt of the flow; the default suits the frequencies of the H that was learned.
+        Δt of the flow; by default it follows from the frequencies of the learned H.
     noise : float or array_like of shape (2d,), optional
         Standard deviation of the observations; estimated if not given.
     separable : bool, optional
@@ -87,59 +87,59 @@ def learn(
         M of T = ½ pᵀM⁻¹p; learned if not given.
     damping : {False, True, "each", "quadratic"}
         True to learn one rate γ of friction, p' = −∂H/∂q − γp; "each" for one rate for each p; "quadratic" for drag,
-        p_i' = −∂H/∂q_i − c_i|p_i|p_i, by which `flow.system` is `sympflow.doubled`.
+        p_i' = −∂H/∂q_i − c_i|p_i|p_i, and `flow.system` is then made by `sympflow.doubled`.
     drive : bool, float or sequence of float
-        True to learn forces and stiffnesses a cos ωt + b sin ωt, and ω, in the time of the data, one or two; or ω,
-        about, in radians per unit of that time, or several. Then `flow.system` is an H(q, p, t) = ½ pᵀM⁻¹p + V(q, t),
-        of period 2π/ω where ω is one, beside friction or none, not beside drag.
+        True to learn forces and stiffnesses a cos ωt + b sin ωt, and ω, in the time of the data, with one or two
+        frequencies; or approximate values of ω in radians per unit of that time. Then `flow.system` is an H(q, p, t) =
+        ½ pᵀM⁻¹p + V(q, t), of period 2π/ω for a single ω. Can be combined with friction, not with drag.
     period : float or array_like of shape (d,), optional
-        Of H in each q, of angles: 2π, or 360 for degrees; infinite or NaN for coordinates that are none. Angles that
-        were wrapped are continued. Without one, angles in radians or degrees are tried as well.
+        The period of H in each q that is an angle: 2π, or 360 for degrees; infinite or NaN for the other coordinates.
+        Wrapped angles are made continuous. Without `period`, angles in radians or degrees are tried too.
     known : HamiltonianSystem, optional
-        A part of H, symbolic; the rest is learned. Its kinetic energy, if it has one, is taken for the whole.
+        A known part of H, symbolic; the rest is learned. If it has a kinetic energy, no other is learned.
     family : str, optional
         The only family to be tried, see `sympflow.learning.families.FAMILIES`.
     loss : {"squares", "huber"}
         "huber" for data with outliers.
     replicas : int
-        So many fits of the chosen model to trajectories that are drawn anew, with repetition (a bootstrap), give
-        `flow.replicas`, whose `bands(y0, t)` tell how certain predictions are.
+        Number of bootstrap replicas: fits of the chosen model to trajectories drawn with repetition. They give
+        `flow.replicas`, whose `bands(y0, t)` are error bands of predictions.
     seed : int
-        Which trajectories are held out, and random starts.
+        Seed of the choice of held-out trajectories and of random starts.
     name : str
         Of the learned system.
     checkpoint, resume, time_budget, progress, callback, workers
-        As for `sympflow.train`; None for a search that ends by itself. A checkpoint is written after each model;
-        `workers` share the replicas.
+        As for `sympflow.train`; by default the search ends by itself. A checkpoint is written after each model;
+        `workers` compute the replicas.
     **reading
         Options of `Trajectories.read`, such as `units`, `order` and `velocity_mass`. With observed="qv" the data have
-        velocities of a mass that is not known, with "q" positions alone: then H is learned but for a factor, by which
-        (M⁻¹)₁₁ is 1, or M₁₁ in the middle of q where M depends on q. `flow.system.momenta(q, v)` are the momenta.
+        velocities with an unknown mass, with "q" positions only: then H is learned up to a factor, which is fixed by
+        (M⁻¹)₁₁ = 1, or by M₁₁ = 1 in the middle of q where M depends on q. `flow.system.momenta(q, v)` are the momenta.
 
     Returns
     -------
     SympFlow
-        With `flow.system`, the H that was learned as an ordinary HamiltonianSystem; `flow.figures`, the errors on held-
+        With `flow.system`, the learned H as an ordinary HamiltonianSystem; `flow.figures`, the errors on held-
         out trajectories and the noise; `flow.recipe["learned"]`, the model and why it was chosen; `flow.history`, a
         record for each model.
 
     Raises
     ------
     ValueError, TypeError
-        If the trajectories are not as they should be, the only one is too short to be cut, they hold fewer numbers than
-        the simplest model has, or an argument is not admissible.
+        If the trajectories are not valid, a single one is too short to be cut, they have fewer values than the simplest
+        model has parameters, or an argument is not admissible.
 
     Warns
     -----
     UserWarning
-        If the residuals of the best model are not noise; with what a vector field that need not be Hamiltonian leaves
-        of them, and the likeliest reason.
+        If the residuals of the best model are not noise. The message gives the residuals of a vector field that need
+        not be Hamiltonian, and the likeliest reason.
 
     References
     ----------
     .. [1] H. G. Bock, Recent advances in parameter identification techniques for O.D.E., in: Numerical Treatment of
        Inverse Problems in Differential and Integral Equations (1983) 95–121, for the shooting.
-    .. [2] G. Schwarz, Estimating the dimension of a model, Ann. Statist. 6 (1978) 461–464, for the terms that are kept.
+    .. [2] G. Schwarz, Estimating the dimension of a model, Ann. Statist. 6 (1978) 461–464, for the choice of the terms.
     """
     data = Trajectories.read(trajectories, ndof, period=period, **reading)
     data.check_moving()

@@ -49,7 +49,7 @@ class Trajectories(Answering):
     names : tuple of str, length 2d
         The names of q1 … qd, p1 … pd in the data.
     velocities : bool
-        True if the second half are velocities q', of a mass that is not known.
+        True if the second half are velocities q', with an unknown mass.
     """
 
     runs: tuple[Run, ...]
@@ -96,7 +96,8 @@ class Trajectories(Answering):
             NaN marks a value that is missing. Points without any value are left out. A trajectory whose times all
             descend is turned around.
         ndof : int, optional
-            Degrees of freedom d; else read off the data. With it a table's columns may have any names, in this `order`.
+            Degrees of freedom d; by default found from the data. If given, the columns of a table may have any names,
+            in the given `order`.
         order : {"halves", "pairs"} or sequence of int
             The order of the rows of y, or of columns whose names are not those of coordinates: q1 … qd, p1 … pd; q1,
             p1, q2, p2, …; or the places of q1 … qd, p1 … pd.
@@ -108,13 +109,13 @@ class Trajectories(Answering):
             The units of columns by their names, of all "q" or "p", and of the time, "t": {"t": "ms", "q": "deg",
             "p": "deg/ms"}, or factors. The data are converted to those of the SI, and to radians.
         velocity_mass : float or array_like of shape (d,) or (d, d), optional
-            M where the data have velocities in place of momenta: then p = M v.
+            M, if the data have velocities in place of momenta: then p = M v.
         observed : {"qp", "qv", "q"}
-            The rows of states: positions with momenta; with velocities, of a mass that is not known and may depend on
-            q; positions alone, y (d, n), of columns q1 … qd.
+            The rows of states: positions and momenta; positions and velocities, with an unknown mass that may depend on
+            q; or positions only, y (d, n), in columns q1 … qd.
         period : float or array_like of shape (d,), optional
-            Of q that are angles, in the converted units; infinite or NaN for coordinates that are none. Where an angle
-            jumps by more than half of it from one point to the next, as one that was wrapped does, it is continued.
+            Period of each q that is an angle, in the converted units; infinite or NaN for the others. A wrapped angle,
+            which jumps by more than half a period from one point to the next, is made continuous.
 
         Raises
         ------
@@ -122,7 +123,7 @@ class Trajectories(Answering):
             If times repeat or go back, widths differ or are odd, a trajectory or a coordinate has no values, or
             columns are not recognized.
         TypeError
-            If `data` is of no kind listed above.
+            If `data` is of another kind.
         ImportError
             If a file needs pandas or xarray and it is not installed.
 
@@ -203,17 +204,17 @@ class Trajectories(Answering):
 
     @property
     def n_values(self) -> int:
-        """The numbers that are not missing."""
+        """The number of values that are not missing."""
         return int(sum(np.isfinite(run.y).sum() for run in self.runs))
 
     @property
     def begins(self) -> np.ndarray:
-        """The places (N,) of the first points of the trajectories among all points."""
+        """The indices (N,) of the first points of the trajectories among all points."""
         return np.concatenate([[0], np.cumsum([run.n_points for run in self.runs])[:-1]])
 
     @cached_property
     def states(self) -> np.ndarray:
-        """The states of all points of which nothing is missing: (n, 2d)."""
+        """The states of all points without missing values: (n, 2d)."""
         points = np.concatenate([run.y.T for run in self.runs])
         return points[np.isfinite(points).all(1)]
 
@@ -221,7 +222,7 @@ class Trajectories(Answering):
     def scales(self) -> np.ndarray:
         """The spread of each coordinate, (2d,): its standard deviation, 1 where it does not change.
 
-        Of velocities that are missing it is that of differences.
+        For missing velocities it is the spread of difference quotients.
         """
         values = np.concatenate([run.y for run in self.runs], axis=1)
         missing = np.isnan(values).all(axis=1)
@@ -238,7 +239,7 @@ class Trajectories(Answering):
 
     @cached_property
     def sample(self) -> Trajectories:
-        """Some short pieces of smooth curves, evenly chosen, by which models are compared."""
+        """Some short pieces of smooth curves, evenly chosen, on which models are compared."""
         pieces = self.pieces(LONG * POINTS)
         n = max(1, min(len(pieces.runs), COMPARED * len(pieces.runs) // max(pieces.n_points, 1)))
         some = pieces.subset(np.unique(np.linspace(0, len(pieces.runs) - 1, n).astype(int)).tolist())
@@ -252,7 +253,7 @@ class Trajectories(Answering):
 
     @property
     def scaling(self) -> Scaling:
-        """Units in which states and steps are of size one, and dq∧dp is a multiple of what it was.
+        """Units in which states and steps are of size one, and dq∧dp is multiplied by a constant.
 
         All products of the units of q_i and p_i agree, so that the equations stay Hamiltonian.
         """
@@ -267,11 +268,11 @@ class Trajectories(Answering):
         return replace(self, runs=tuple(Run(run.t / scaling.t, run.y / units) for run in self.runs))
 
     def unwrapped(self, periods: np.ndarray) -> Trajectories:
-        """The trajectories with angles of these periods (d,) continued where they jump by more than half a period."""
+        """Trajectories with angles of these periods (d,) made continuous where they jump by more than half a period."""
         return replace(self, runs=tuple(Run(run.t, _unwrapped(run.y, periods)) for run in self.runs))
 
     def check_angles(self, none: np.ndarray | None = None) -> None:
-        """Raise ValueError if a coordinate jumps as a wrapped angle does, and is not known (d,) to be none."""
+        """Raise ValueError if a coordinate jumps like a wrapped angle, unless it is marked (d,) as not an angle."""
         for i, name in enumerate(self.names[: self.ndof]):
             if none is not None and none[i]:
                 continue
@@ -289,7 +290,7 @@ class Trajectories(Answering):
                     )
 
     def check_moving(self) -> None:
-        """Raise ValueError where a coordinate stands still or has no powers; warn of one that is far from 0."""
+        """Raise ValueError if a coordinate is constant or its powers overflow; warn of one that is far from 0."""
         for i, name in enumerate(self.names):
             values = np.concatenate([run.y[i] for run in self.runs])
             seen = values[np.isfinite(values)]
@@ -332,8 +333,8 @@ class Trajectories(Answering):
         return self.subset(i for i in range(len(self.runs)) if i not in drawn), self.subset(sorted(drawn))
 
     def folds(self, share: float = 0.2, seed: int = 0) -> list[tuple[Trajectories, Trajectories]]:
-        """Divisions as by `split`: one, of three held-out trajectories at least; of few trajectories each is left out
-        in one of three, or in turn.
+        """Divisions as by `split`: one, with at least three held-out trajectories; or of few trajectories those of a
+        threefold or leave-one-out cross-validation.
 
         Raises
         ------
@@ -348,19 +349,19 @@ class Trajectories(Answering):
         return [(self.subset(j for j in range(n) if j not in part), self.subset(part)) for part in parts]
 
     def subset(self, index: Any) -> Trajectories:
-        """The trajectories of some places, which may repeat, as a bootstrap draws them."""
+        """The trajectories with these indices, which may repeat, as in a bootstrap."""
         return replace(self, runs=tuple(self.runs[i] for i in index))
 
     def pieces(self, points: int | None = None, span: float = np.inf) -> Trajectories:
-        """Trajectories cut into pieces, each of them a trajectory of its own; no point is in two of them.
+        """The trajectories cut into disjoint pieces, each of which is a trajectory.
 
         Parameters
         ----------
         points : int, optional
-            The most points of a piece, at least 2. A last piece of one point goes to the piece before.
+            The most points of a piece, at least 2. A last piece of one point is joined to the piece before.
         span : float
-            The longest time of a piece, which holds two points at least. Of chaotic orbits this is one or two
-            Lyapunov times.
+            The longest time of a piece, which has at least two points. For chaotic orbits choose one or two Lyapunov
+            times.
         """
         most = sys.maxsize if points is None else plain(points)
         if isinstance(most, bool) or not isinstance(most, int) or most < 2:

@@ -18,20 +18,20 @@ from sympflow.solver import solve
 def reference_error(sol: Solution, reference: Reference | Solution | ArrayLike | None = None) -> np.ndarray:
     """‖y(t) − y_ref(t)‖₂ at the times `sol.t`, in units of q: (..., n).
 
-    Each momentum counts as its amplitude in q, pᵢ/sᵢ² with s² = mω the system's natural scale, 1 of an oscillator with
-    m = ω = 1: so the order of methods does not depend on units.
+    Each momentum counts as its amplitude in q, pᵢ/sᵢ², where s² = mω is the system's natural scale, 1 for an oscillator
+    with m = ω = 1: so the ranking of methods does not depend on units.
 
     Parameters
     ----------
     sol : Solution
     reference : Reference, Solution or array_like (..., 2d, n), optional
         States at the same times. The default computes them with `sympflow.metrics.reference.reference`, which is exact
-        for a quadratic H and otherwise says how it was made and how accurate it is.
+        for a quadratic H and otherwise has attributes for its method and its accuracy.
 
     Raises
     ------
     TypeError
-        If `sol` is not a Solution, or `reference` is nothing that holds states.
+        If `sol` is not a Solution, or `reference` does not hold states.
     ValueError
         If the reference is not at the times of the solution, or is a solution of another problem.
     """
@@ -124,7 +124,7 @@ def time_reversal_error(sol: Solution) -> np.floating | np.ndarray:
     """‖y − y0‖₂, as in `reference_error`, after the run forwards to its end and the same method back from there, (...).
 
     On a grid that divides the interval it is at rounding level for a method with Φ(−h) = Φ(h)⁻¹, and for one that goes
-    back by its exact inverse, as a SympFlow does. inf for a trajectory that does not get there and back.
+    back by its exact inverse, as a SympFlow does. inf for a trajectory that fails on the way.
 
     Raises
     ------

@@ -97,8 +97,8 @@ def lyapunov(
 ) -> Indicator:
     """The largest Lyapunov exponent of each orbit: ln(|w(t)|/|w(0)|)/|t − t0|, of a deviation vector w.
 
-    Lengths are those of (s δq, δp/s), where s = √(mω) makes q and p comparable in any units; it is 1 where masses and
-    frequencies are, as in the Hénon–Heiles system.
+    Lengths are those of (s δq, δp/s), where s = √(mω) makes q and p comparable in any units; it is 1 for unit masses
+    and frequencies, as in the Hénon–Heiles system.
 
     As t grows it tends to the exponent of the orbit, for almost all initial vectors [1]_ [2]_: to a positive number on
     a chaotic one, and like ln(t)/t to 0 on a regular one, so that a value of that size at the end of the run does not
@@ -108,18 +108,18 @@ def lyapunov(
     ----------
     system : HamiltonianSystem
     method : str, Integrator or trained flow, optional
-        By default one that suits the system, as for `solve`. Splitting methods run compiled on
-        symbolic systems; of others each step is differentiated, which takes longer.
+        By default one that suits the system, as for `solve`. Splitting methods run compiled on symbolic systems; in
+        other cases each step is differentiated, which takes longer.
     t_span : (float, float), optional
-        The default is the system's. With fixed steps the run ends with the last whole one.
+        The default is the system's. With fixed steps the run ends with the last full step.
     y0 : array_like of shape (..., 2d), optional
         One state, or a batch of them. The default is the system's.
     t_eval : array_like of shape (n,), optional
-        Times at which to report the average so far too: `history`.
+        Times at which the average so far is reported in `history`.
     deviations : array_like of shape (2d,), optional
         w(0). The default is a random direction of (s δq, δp/s), the same for all orbits.
     seed : int
-        Of this direction.
+        Seed of this direction.
     backend : "auto", "compiled" or "array"
         As for `solve`.
     **options
@@ -132,7 +132,7 @@ def lyapunov(
     Raises
     ------
     ValueError, TypeError
-        For bad arguments, at once; and if the steps of the method are not differentiated in y at a fixed t.
+        For bad arguments, at once; and for methods whose steps cannot be differentiated in y at a fixed t.
 
     References
     ----------
@@ -164,7 +164,7 @@ def sali(
     backend: str = "auto",
     **options: Any,
 ) -> Indicator:
-    """The smaller alignment index of each orbit: min(|u + v|, |u − v|) of two deviation vectors made unit vectors.
+    """The smaller alignment index of each orbit: min(|u + v|, |u − v|) of two normalised deviation vectors.
 
     On a chaotic orbit it falls like exp(−(λ₁ − λ₂)t), λ the two largest Lyapunov exponents, to the last bit; on a
     regular one in two or more degrees of freedom it stays between constants [1]_. In one degree of freedom, where all
@@ -175,9 +175,9 @@ def sali(
     system, method, t_span, y0, t_eval, seed, backend, **options
         As for `lyapunov`.
     below : float
-        An orbit ends where the index falls below this number, and is chaotic; 0 to go on to the end.
+        An orbit ends, as chaotic, when its index falls below this number; 0 to go on to the end.
     deviations : array_like of shape (2, 2d), optional
-        The vectors at the start. The default is two random directions at right angles.
+        The vectors at the start. The default is two random orthogonal directions.
 
     Returns
     -------
@@ -218,7 +218,7 @@ def gali(
     backend: str = "auto",
     **options: Any,
 ) -> Indicator:
-    """The generalised alignment index of order k: the volume that k deviation vectors, made unit vectors, span.
+    """The generalised alignment index of order k: the volume that k normalised deviation vectors span.
 
     On a chaotic orbit it falls like exp(−Σ_{j=2..k} (λ₁ − λ_j) t); on a regular one it stays near a constant for k up
     to the dimension of its torus, d as a rule, and falls like t^{−2(k − d)} for more vectors [1]_.
@@ -230,9 +230,9 @@ def gali(
     k : int
         From 2 to 2d.
     below : float
-        An orbit ends where the index falls below this number; 0 to go on to the end.
+        An orbit ends when its index falls below this number; 0 to go on to the end.
     deviations : array_like of shape (k, 2d), optional
-        The vectors at the start. The default is random directions at right angles, for which the index is 1.
+        The vectors at the start. The default is random orthogonal directions, for which the index is 1.
 
     Returns
     -------
@@ -245,7 +245,7 @@ def gali(
 
     Notes
     -----
-    The volume |w₁ ∧ … ∧ w_k| is computed by making the vectors orthogonal one after the other.
+    The volume |w₁ ∧ … ∧ w_k| is computed by Gram–Schmidt orthogonalisation.
 
     References
     ----------

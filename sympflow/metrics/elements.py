@@ -47,14 +47,14 @@ def elements(solution: Solution | ArrayLike, system: HamiltonianSystem | None = 
     solution : Solution, or array_like of shape (..., 2d)
         A solution, or states.
     system : HamiltonianSystem, optional
-        That of states: see `HamiltonianSystem.planets`.
+        The system of the states, if these are given: see `HamiltonianSystem.planets`.
     about : {"star", "jacobi"}
-        The centre: the star, or the centre of mass of all that is inside of the orbit.
+        The centre: the star, or the centre of mass of all bodies inside the orbit.
 
     Returns
     -------
     Elements
-        Of a solution arrays (..., planets, n), of states (..., planets).
+        Arrays (..., planets, n) for a solution, (..., planets) for states.
 
     Raises
     ------

@@ -36,8 +36,8 @@ def energy_error(sol: Solution, relative: bool = True) -> np.ndarray:
 
     The largest magnitude over the run is `max_energy_error(sol)`.
 
-    Where the state is finite and H of it is beyond floats, so that inf − inf would be NaN, the error is inf. NaN is
-    left where the state is: after the end of a trajectory in a batch.
+    Where the state is finite but H overflows, the error is inf. It is NaN where the state is: after the end of a
+    trajectory in a batch.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ def energy_error(sol: Solution, relative: bool = True) -> np.ndarray:
     Warns
     -----
     RuntimeWarning
-        If the scale is missing (see `energy_scale`), so that the error of some trajectory is absolute.
+        If the scale of a trajectory is 0 (see `energy_scale`), so that its error is absolute.
 
     Raises
     ------
@@ -73,8 +73,8 @@ def energy_scale(sol: Solution) -> np.ndarray:
 def max_energy_error(sol: Solution, relative: bool = True) -> np.floating | np.ndarray:
     """max over `sol.t` of |energy_error|, (...).
 
-    It is inf for a trajectory that became non-finite or could not be continued, however few of its outputs were stored
-    before: a blow-up never looks small.
+    It is inf for a trajectory that became non-finite or could not be continued, even if few of its outputs were stored:
+    a blow-up never looks small.
     """
     return largest(np.abs(energy_error(sol, relative)), sol)[()]
 
@@ -121,7 +121,7 @@ def energy_drift(sol: Solution, blocks: int = MIN_BLOCKS, relative: bool = True)
     Parameters
     ----------
     sol : Solution
-        With outputs at regular times, at least one for each block; better ten.
+        With outputs at regular times, at least one for each block; ten are better.
     blocks : int
         Number of blocks, at least 20.
 
@@ -195,9 +195,9 @@ def energy_growth(sol: Solution, first: float = 1000.0) -> EnergyGrowth:
     Parameters
     ----------
     sol : Solution
-        Of a fixed-step method, better of a batch of eight trajectories or more, with regular outputs (`save_every`).
+        Of a fixed-step method, preferably a batch of at least eight trajectories, with regular outputs (`save_every`).
     first : float
-        Steps before which the outputs are not used.
+        Number of the first step whose output is used.
 
     Raises
     ------
@@ -208,7 +208,7 @@ def energy_growth(sol: Solution, first: float = 1000.0) -> EnergyGrowth:
 
     Notes
     -----
-    Of a run at regular times the slope through the origin, Σ eₖtₖ/Σ tₖ², is fitted to each trajectory.
+    The slope through the origin, Σ eₖtₖ/Σ tₖ², is fitted to each trajectory.
 
     References
     ----------

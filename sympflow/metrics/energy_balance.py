@@ -23,12 +23,12 @@ NODES, WEIGHTS = np.polynomial.legendre.leggauss(6)
 def energy_balance_error(sol: Solution, relative: bool = False) -> np.ndarray:
     """|H(t, x) − H(t0, x0) − ∫ ∂H/∂t dt| at the times `sol.t`: (..., n), in float64.
 
-    The integral is the one that the method itself makes: −E, the momentum of the time in the extended system
-    E + H(t, x), which is autonomous. Its energy E + H is what a symplectic method keeps in the long run. A kick by
-    b h V(q, t) at its fixed time t adds b h ∂V/∂t to the integral, force gradients their part; Runge–Kutta and implicit
-    methods take ∂H/∂t at their stages, by their weights. For this the run is executed once more, compiled where it was,
-    with E as one more momentum; memory is that of the outputs. Methods that choose their steps then control the error
-    of E too.
+    The integral is computed by the method itself: −E, the momentum of the time in the extended system
+    E + H(t, x), which is autonomous. Its energy E + H is what a symplectic method keeps in the long run. A kick by b h
+    V(q, t) at its fixed time t adds b h ∂V/∂t to the integral, force gradients add the derivative of their term;
+    Runge–Kutta and implicit methods take ∂H/∂t at their stages, by their weights. For this the run is repeated,
+    compiled if it was, with E as an additional momentum; it needs memory for the outputs only. Methods that choose
+    their steps then control the error of E too.
 
     For systems without symbols, T(p, t) in splitting methods, splittings other than "kinetic", and trained flows that
     are not primed, it is the integral of ∂H/∂t along the steps as executed, by Gauss–Legendre quadrature of 6 nodes

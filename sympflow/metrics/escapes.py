@@ -71,9 +71,9 @@ def escape_times(
 ) -> Escapes:
     """The times at which orbits leave a region of phase space.
 
-    The states after the steps are looked at; between the last one inside and the first one outside the time is found
-    by halving, on shorter steps. An orbit that is outside only between two steps is not seen. The run streams, and
-    ends for orbits that have left.
+    The states after each step are checked; the time of the escape is found by bisection, with shorter steps from the
+    last state inside. An orbit that is outside only between two steps is not detected. No states are stored, and an
+    orbit that has left is not continued.
 
     Parameters
     ----------
@@ -83,8 +83,8 @@ def escape_times(
     t_span, y0
         As for `solve`; y0 may be a batch of shape (..., 2d).
     outside : float, domain or callable, optional
-        A radius, outside of which |q| is larger; a domain such as `sympflow.Box`, outside of which a state does not lie
-        in it; or a function of states (..., 2d) that returns booleans (...). The default is the system's domain.
+        A radius: outside is |q| > radius; a domain such as `sympflow.Box`: outside is not in it; or a function of
+        states (..., 2d) that returns booleans (...). The default is the system's domain.
     backend : "auto", "compiled" or "array"
         As for `solve`.
     **options

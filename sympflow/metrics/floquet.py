@@ -80,7 +80,7 @@ def floquet_multipliers(
     t0: float = 0.0,
     **options: Any,
 ) -> FloquetMultipliers:
-    """The Floquet multipliers of the orbit from y0 that is periodic, by the Jacobians of the steps of a method.
+    """The Floquet multipliers of the periodic orbit from y0, by the Jacobians of the steps of a method.
 
     Parameters
     ----------
@@ -88,10 +88,10 @@ def floquet_multipliers(
     y0 : array_like of shape (2d,), optional
         A state of the orbit at the time t0; the default is the system's. An equilibrium is periodic too.
     period : float, optional
-        T; the default is that of a driven system. The step of a method with fixed steps, `dt`, need not divide it.
+        T; the default is that of a driven system. A fixed step `dt` need not divide it.
     method : str, Integrator or trained flow
     t0 : float
-        Where the period begins, for a driven system; the multipliers do not depend on it.
+        The start of the period, for a driven system; the multipliers do not depend on it.
     **options
         Options of the method, such as `dt`; by default the largest below `system.dt` that divides the period.
 
@@ -103,13 +103,13 @@ def floquet_multipliers(
     ------
     ValueError, TypeError
         For bad arguments; if no period is known; if y0 is a batch; if the run of a period fails; if the method chooses
-        its steps, by the error of the orbit and not of deviations from it.
+        its steps, because it does so by the error of the orbit and not of deviations from it.
 
     Warns
     -----
     RuntimeWarning
         If the orbit is not periodic: its end is farther than 1e-6 of its size from y0; and if the multipliers are not
-        in pairs, to 1e-3, as by an explicit Runge–Kutta method of long steps. The eigenvalues then mean little.
+        in pairs, to 1e-3, as by an explicit Runge–Kutta method with long steps. The eigenvalues are then unreliable.
 
     Examples
     --------

@@ -81,7 +81,7 @@ def frequencies(
 
     A line starts at the maximum of the Fourier transform of the signal, times a Hann window; there the frequency is
     refined until |⟨z, exp(iωt)⟩| is largest. The lines are made orthogonal one after another as by Gram and Schmidt,
-    and each is refined again with the others taken off. Over a time T the error falls like T⁻⁴, where that of the
+    and each is refined again after the others are subtracted. Over a time T the error falls like T⁻⁴, where that of the
     Fourier transform falls like T⁻¹. The difference of the frequencies of two halves of an orbit measures its
     diffusion: on a torus it is 0 [2]_.
 
@@ -97,12 +97,12 @@ def frequencies(
     n : int
         Lines of each signal.
     signal : callable, optional
-        Of states (..., 2d, m) at m times: complex or real signals (..., m), or (..., c, m). The default is
-        z_i = s_i q_i − i p_i/s_i of each degree of freedom, for which a rotation as of an oscillator is positive; the s
-        make q and p comparable: √(mω) of an oscillator of frequency ω and mass m, 1 in natural units.
+        A function of states (..., 2d, m) at m times that returns complex or real signals (..., m), or (..., c, m). The
+        default is z_i = s_i q_i − i p_i/s_i of each degree of freedom, for which the rotation of an oscillator is
+        positive; s makes q and p comparable: √(mω) of an oscillator of frequency ω and mass m, 1 in natural units.
     samples : int, optional
-        The default is one after each step, or after every few, so that there are at most 65536. Frequencies above
-        π·samples/|t1 − t0| are taken for others.
+        Number of samples; by default one after each step, or after every few, so that there are at most 65536.
+        Frequencies above π·samples/|t1 − t0| are aliased.
     backend : "auto", "compiled" or "array"
         As for `solve`.
     **options
@@ -119,7 +119,7 @@ def frequencies(
 
     Notes
     -----
-    The samples of some orbits are held at a time, 16 MB of them or those of one orbit.
+    At most 16 MB of samples are held at a time, or those of one orbit.
 
     References
     ----------

@@ -104,7 +104,7 @@ class LinearStability:
 
 
 def linear_stability(method: Any) -> LinearStability:
-    """Return the z = dt·ω at which a splitting method is stable on the oscillator H = (p² + ω²q²)/2.
+    """Return the intervals of z = dt·ω in which a splitting method is stable on the oscillator H = (p² + ω²q²)/2.
 
     Parameters
     ----------
@@ -118,9 +118,9 @@ def linear_stability(method: Any) -> LinearStability:
 
     Notes
     -----
-    The trace is computed in rational numbers from the coefficients of the table, its extrema in 100 digits. One that
-    exceeds ±1 by no more than what the rounding of the coefficients can do only touches it: a resonance.
-    The window of a scheme of high order near z = π is narrow, as ½ tr = cos z + O(z^(order + 2)), but there.
+    The trace is computed in rational numbers from the coefficients of the table, its extrema in 100 digits. An extremum
+    that exceeds ±1 by no more than the rounding of the coefficients counts as touching: a resonance. The instability of
+    a scheme of high order near z = π is narrow, because ½ tr = cos z + O(z^(order + 2)), but it exists.
 
     Examples
     --------

@@ -30,7 +30,7 @@ def step_tangents(sol: Solution) -> Iterator[tuple[np.ndarray, np.ndarray, np.nd
 def volume_error(sol: Solution, over_time: bool = False) -> np.floating | np.ndarray:
     """Σ log|det A_k| over the executed steps: the logarithm of the factor by which phase-space volume changed.
 
-    0 for a map that keeps volume, and at rounding level (about 1e-16 a step, 1e-7 in float32) for every symplectic
+    0 for a map that preserves volume, and at rounding level (about 1e-16 a step, 1e-7 in float32) for every symplectic
     method. inf for a trajectory that became non-finite or could not be continued.
 
     Parameters
@@ -110,19 +110,18 @@ def symplecticity_defect(
 
     A symplectic step has defect 0 up to the rounding of A, in the precision of the run, which is proportional to ‖A‖².
     The Jacobian A is taken in the variables (s q, p/s), which keep the form J and remove the imbalance of a stiff
-    oscillator, or of units. The defect is inf for a trajectory that became non-finite or could not be continued. Of
-    lattices and pairs of more than 200 degrees of freedom it is the value of `symplecticity_estimate`, which says the
-    error too, unless it is to be `relative` or a `scale` is given. Bodies without mass have a form of their own, with
-    momenta per unit mass, which is kept for given motions of the others: their rates by those of the others are left
-    out.
+    oscillator, or of units. The defect is inf for a trajectory that became non-finite or could not be continued. For
+    lattices and pairs of more than 200 degrees of freedom it is the value of `symplecticity_estimate`, which also gives
+    the error, unless `relative` or `scale` is given. For bodies without mass the form is that of momenta per unit mass,
+    at given motion of the other bodies: derivatives by those are left out.
 
     Parameters
     ----------
     sol : Solution
     relative : bool
     scale : array_like (d,) or float, optional
-        The factors s > 0. The default is √(mω) for an oscillator of frequency ω and mass m, of another system that of
-        its second derivatives at q = p = 0, or else at y0.
+        The factors s > 0. The default is √(mω) for an oscillator of frequency ω and mass m, and for another system is
+        found from its second derivatives at q = p = 0, or else at y0.
 
     Raises
     ------
@@ -151,7 +150,7 @@ def symplecticity_estimate(sol: Solution, directions: int = 8, seed: int = 0) ->
 
     For random vectors u and v of independent standard normal numbers (uᵀEv)² has the mean ‖E‖_F² of any matrix E. Every
     step is differentiated along `directions` vectors, at the cost of as many steps by array operations, and the mean is
-    taken over their pairs. ‖E‖_F/√(2d) is the mean defect of a direction; ‖E‖₂, which `symplecticity_defect` is of
+    taken over their pairs. ‖E‖_F/√(2d) is the mean defect of a direction; ‖E‖₂, which `symplecticity_defect` gives for
     small systems, is between it and √(2d) times it.
 
     Parameters
@@ -334,7 +333,7 @@ def loop_area_error(sol: Solution) -> np.ndarray:
     TypeError
         If `sol` is not a Solution.
     ValueError
-        If the solution is not one of a loop.
+        If the initial states do not form a loop.
     """
     check_solution(sol)
     _check_kept(sol, "area")

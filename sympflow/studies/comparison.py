@@ -66,7 +66,7 @@ def compare(
 ) -> Comparison:
     """Run every method on the system and measure it, at the same instants and against one reference.
 
-    A method that does not apply, or fails, gets a row that says why.
+    A method that does not apply, or fails, gets a row with the reason.
 
     Parameters
     ----------
@@ -76,29 +76,29 @@ def compare(
         (label, any of these).
     metrics : sequence of str, optional
         Any of "error", "energy", "drift", "volume", "symplecticity" and "reversal"; of a driven system "balance", the
-        energy balance, in place of "energy" and "drift"; of a damped one "conformal" in place of all that is not kept.
-        By default those that apply to the system, without "reversal". Others are not computed.
+        energy balance, in place of "energy" and "drift"; of a damped one "conformal" in place of metrics of conserved
+        quantities. By default those that apply to the system, without "reversal".
     t_span, y0 : optional
         Interval and initial state (or batch); the system's by default.
     dt : float, optional
         Step of the fixed-step classical methods that are given by name; `system.dt` by default.
     n_outputs : int
-        Number of instants: one in each of so many equal parts of the interval, at places that meet all phases of an
-        oscillation, the last at the end.
+        Number of instants: one in each of `n_outputs` equal parts of the interval, placed so that all phases of an
+        oscillation occur, the last at the end.
     repeats : int
-        Runs that are timed, interleaved over the methods, after one that is not. Compilation is measured apart, as
-        `compile_time`.
+        Number of timed runs, interleaved over the methods, after one that is not timed. Compilation is measured
+        separately, as `compile_time`.
     match : "time", "evaluations" or "energy_error", optional
-        Tune the steps and tolerances of the methods after the first until they equal it in this.
+        Tune the steps and tolerances of the other methods until they equal the first method in this quantity.
         By default each method runs at its stated step or tolerance.
     reference : Reference, Solution or array_like (..., 2d, n_outputs), optional
-        States at the instants that are compared: its own times, of an array `n_outputs` that are equally spaced and end
-        at the end of the interval. Computed by default: exact, or tighter than the smallest error by a factor of 100
-        where float64 can hold that.
+        States at the instants that are compared: its own times; for an array `n_outputs` equally spaced ones that end
+        at the end of the interval. By default it is computed: exact, or 100 times as accurate as the smallest error as
+        far as float64 allows.
     backend : "auto", "compiled" or "array"
-        As for `solve`; a method that lacks the backend asked for gets a row that says so.
+        As for `solve`; a method without that backend gets a row with the reason.
     progress : callable, optional
-        Called with a line of text when something begins.
+        Called with a line of text at the start of each part.
 
     Returns
     -------

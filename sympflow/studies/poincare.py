@@ -45,11 +45,11 @@ def poincare_section(
 ) -> PoincareSection:
     """The states in which trajectories cross the plane y[coordinate] = level, or those after each period.
 
-    Each crossing is located to rounding on the dense output of the method, as an event is: of fixed steps that is a
-    shorter step. The run streams: only the crossings are stored.
+    Each crossing is located to rounding on the dense output of the method, as an event is: with fixed steps by a
+    shorter step. Only the crossings are stored.
 
-    Of a driven system the section is *stroboscopic*: the states at t0, t0 + T, t0 + 2T …, which are ends of steps; the
-    map from each to the next is that of a system of d degrees of freedom, area-preserving for d = 1 without friction.
+    Of a driven system the section is *stroboscopic*: the states at t0, t0 + T, t0 + 2T …, which are ends of steps. For
+    d = 1 without friction the map from each to the next preserves area.
 
     Parameters
     ----------
@@ -67,8 +67,8 @@ def poincare_section(
         By default 0.
     direction : 1, -1 or 0, optional
         Only crossings upwards, the default, only downwards, or both, along the run as for events: in a run backward in
-        time the coordinate decreases with t where it is crossed upwards. A start on the plane counts, as it does for
-        events.
+        time the coordinate decreases with t where it is crossed upwards. A start on the plane counts as a crossing, as
+        for events.
     sample : float, optional
         Longest time between two samples; two crossings within it are missed. The default is `system.dt`, or the
         method's step where that is shorter.
@@ -76,12 +76,12 @@ def poincare_section(
         T, for a stroboscopic section; by default that of a driven system. Not together with a plane. Fixed steps become
         the largest up to `dt` that divides T; trained flows keep theirs.
     energy : float, optional
-        In place of `y0`: orbits that start on the plane with this H. Their sections do not cross, for two degrees of
-        freedom, as those of different energies do.
+        In place of `y0`: orbits that start on the plane with this H. For two degrees of freedom the sections of orbits
+        with one energy do not intersect.
     n : int, optional
         Orbits of this energy; by default 16.
     seed : int
-        Of their starts, which are drawn at random.
+        Seed of their random initial states.
     **options
         Options of the method.
 
@@ -257,7 +257,7 @@ class PoincareSection(Report):
         As of a `Solution`: 0 where the end was reached, −1 where the run failed. Crossings shortly before a failure may
         be those of a solution that is exploding already.
     message : str
-        In words, with the time and the remedy.
+        The status in words, with the time and the remedy.
     period : float or None
         T of a stroboscopic section.
     """

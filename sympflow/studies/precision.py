@@ -61,8 +61,8 @@ def work_precision(
 ) -> WorkPrecision:
     """Sweep steps and tolerances, and measure error, run time and evaluations.
 
-    The error is that of the energy; of a driven system that of the energy balance, see `energy_balance_error`; of a
-    damped one that of the state. The error of the state is measured of all.
+    The error is the energy error; for a driven system that of the energy balance, see `energy_balance_error`; for a
+    damped one that of the state. The error of the state is always measured as well.
 
     Parameters
     ----------
@@ -79,13 +79,13 @@ def work_precision(
     tolerances : sequence of float
         rtol of adaptive methods, with atol = rtol/1000, the ratio of SciPy's defaults, times the size of q and p at y0.
     n_outputs : int
-        Number of instants, as for `compare`. Reaching one between two steps costs a method a shorter step, in run time
-        and in evaluations: with steps as long as the time between instants it is the outputs that are measured.
+        Number of instants, as for `compare`. An instant between two steps costs a shorter step, in run time and in
+        evaluations: for steps as long as the time between instants the outputs dominate the cost.
     repeats : int
         Timed runs of each point, interleaved over all points of one batch size.
     budget : float
-        Seconds that the repeats of one point may take; where one run takes longer, it is not repeated. All that a
-        method runs is compiled before, in `compile_time`.
+        Seconds that the repeats of one point may take; where one run takes longer, it is not repeated. The code of a
+        method is compiled before, in `compile_time`.
     backend, progress
         As for `compare`.
 

@@ -77,14 +77,14 @@ def stability(
     limits: bool = True,
     progress: Callable[[str], None] | None = None,
 ) -> StabilityReport:
-    """Run every method with a range of steps, find the longest stable one, and say how the longer ones fail.
+    """Run every method with a range of steps, find the longest stable one, and report how longer ones fail.
 
-    The longest stable step is the first loss of stability. If H is quadratic and the method composed of kicks and
-    drifts, it is known for certain, from the trace of a step: see `sympflow.metrics.linear_stability`. Else steps are
-    doubled from an eighth of that limit for small oscillations, or of the system's `dt`, until one is unstable; in
-    the three octaves below it steps at ratios of 2^(1/8) are tried, of 2^(1/4) for methods that are not compiled, and
-    in every window of linear instability four steps, or its middle; the first loss is found by bisection, to 0.2 %.
-    The answer does not depend on `steps`, unless one of them is unstable below it: then that one counts.
+    The longest stable step is that of the first loss of stability. If H is quadratic and the method composed of kicks
+    and drifts, it is computed from the trace of a step: see `sympflow.metrics.linear_stability`. Else steps are doubled
+    from an eighth of that limit for small oscillations, or of the system's `dt`, until one is unstable; in the three
+    octaves below it steps at ratios of 2^(1/8) are tried, of 2^(1/4) for methods that are not compiled, and in every
+    window of linear instability four steps, or its middle; the first loss is found by bisection, to 0.2 %. The answer
+    does not depend on `steps`, unless one of them is unstable below it: then that one counts.
 
     Parameters
     ----------
@@ -98,20 +98,20 @@ def stability(
         The default is the system's. It is extended to hold `min_steps` steps, and shortened to hold `max_steps`.
     y0 : array_like (2d,) or (n, 2d), optional
         Initial states. From one state, by default the system's, three more are taken along its orbit: from a single
-        state an instability may not show (of an oscillator at rest at its largest q, at exactly dt·ω = 2).
+        state an instability may not show (for an oscillator at rest at its largest q, at exactly dt·ω = 2).
     dtypes : sequence of "float64", "float32"
     metrics : sequence of str
         Any of "energy", "drift", "volume", "symplecticity" and "domain". The Jacobians for volume and symplecticity
         are those of the first 256 steps.
     bound : float
-        A run whose energy error exceeds it counts as unstable, as one that becomes non-finite does.
+        A run whose energy error exceeds this bound, or that becomes non-finite, counts as unstable.
     min_steps, max_steps : int
-        Steps of a run; where both cannot be, `max_steps` holds. Methods that run with array operations, and float32,
-        take at most `max_steps`/200.
+        Limits of the number of steps of a run; if they contradict each other, `max_steps` applies. Methods that run
+        with array operations, and float32, take at most `max_steps`/200.
     limits : bool
         True to find the longest stable step.
     progress : callable, optional
-        Called with a line of text when something begins: a method, each of its steps, each trial for the longest one.
+        Called with a line of text at the start of each method, each of its steps, and each trial for the longest one.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""The scenes by name: the built-in ones, those registered at run time, and those of installed plug-ins."""
+"""The scenes by name: built in, registered at run time, or from installed plug-ins."""
 
 import inspect
 from collections.abc import Callable

@@ -117,19 +117,19 @@ class _Options:
 
 @dataclass(frozen=True)
 class GaussNewton(_Options):
-    """Damped Gauss–Newton steps on residuals; it stops by itself.
+    """Damped Gauss–Newton steps on residuals; the iteration stops by itself.
 
     Parameters
     ----------
     steps : int, optional
         The most steps: by default 1000 of each fit of a primed flow, 150 of a split one, 200 of a network.
     restarts : int, optional
-        Starts of the search for a primed or a split flow: the flow as it is, then random tables. By default 24 and 8.
-        Without `budget` a new primed flow has 72 in up to three degrees of freedom of a symbolic system, and fewer than
-        24 beyond six degrees of freedom.
+        Number of starts of the search for a primed or a split flow: the untrained flow, then random tables. By default
+        24 and 8. Without `budget` a new primed flow has 72 in up to three degrees of freedom of a symbolic system, and
+        fewer than 24 beyond six degrees of freedom.
     refresh, validate_every, checkpoint_every : int
-        Of other flows, in steps: how long points are kept, None for the whole run; how often held-out figures are
-        taken, and a checkpoint is written.
+        For other flows, in steps: how long the same points are used, None for the whole run; how often held-out errors
+        are measured; how often a checkpoint is written.
     """
 
     steps: int | None = option(count)
@@ -152,7 +152,8 @@ class Adam(_Options):
     learning_rate : float
         The largest of the schedule.
     schedule : {"one-cycle", "cosine", "constant"}
-        Cosine up over the first 5 % and down to 1e-3 of the peak; only down; or none.
+        "one-cycle": cosine up over the first 5 % and down to 1e-3 of the peak; "cosine": only down; "constant": no
+        schedule.
     clip : float or None
         Largest norm of the gradient.
     refresh, validate_every, checkpoint_every
@@ -197,7 +198,7 @@ class BFGS(_Options):
 
 @dataclass(frozen=True)
 class LBFGS(BFGS):
-    """Limited-memory BFGS, likewise; for networks of more than 8000 parameters."""
+    """Limited-memory BFGS, see `BFGS`; for networks of more than 8000 parameters."""
 
     steps: int = option(count, 500)
 
@@ -316,30 +317,30 @@ class PrimedFit(_LossFit):
     Parameters
     ----------
     dt : float, optional
-        Δt; by default what suits the system's frequencies on Ω, or what short trials find best.
+        Δt; by default it follows from the frequencies on Ω, or from short trials.
     stages, processor, curvature, polynomial, first, scheme, force_gradient, dtype, device
-        Of the new flow, see `SympFlow.primed`. By default 3 kicks, or as many as a given `dt` needs, and a processor of
-        6, if no trials choose them.
+        Of the new flow, see `SympFlow.primed`. By default trials choose them, or else 3 kicks, or as many as a given
+        `dt` needs, and a processor of 6.
     points : int, optional
         Labelled states: by default 250, fewer for more than 4 degrees of freedom.
     label_times : int
         Number of equidistant times in (0, Δt] at which they are labelled.
     frozen_weight : float
-        Weight of the residuals at t = Δt, which alone are composed over many steps; those at other times have 1.
+        Weight of the residuals at t = Δt, which only are composed over many steps; at other times it is 1.
     energy_weight : float
-        Weight of the labels' errors in the energy, (∇H·δ)² in units of the spread of H over Ω, beside those of the
-        coordinates; 1000 for runs of which only the energy matters, 0 for none.
+        Weight of the labels' errors in the energy, (∇H·δ)² in units of the spread of H over Ω, in addition to those of
+        the coordinates; 1000 if only the energy of a run matters, 0 for none.
     loss : str, optional
         Some of "residual", "matching" and "labels", joined by "+"; "labels" by default.
     residual_weight, matching_weight, label_weight : float, optional
-        Weights of ‖d/dt ψ̄_t(x) − J∇H‖², of (𝓗 − H − c(t))² and of the labels, of the losses that are named: 1.
+        Weights of ‖d/dt ψ̄_t(x) − J∇H‖², of (𝓗 − H − c(t))² and of the labels, for the named losses 1.
     loss_points, matching_times : int
-        Points of each of the first two, and the number of times in the second.
+        Number of points of the residual and of the matching loss, and number of times of the latter.
     data : (array (n,), array (n, 2d), array (n, 2d)), optional
         Labels of your own: times in [0, Δt], states, and where the exact flow takes them.
     runs : int, optional
-        Of a lattice: after the search the numbers are fitted further to the energy errors of so many long runs of a
-        larger ring; 48 is usual.
+        For a lattice: after the search the numbers are fitted further to the energy errors of this number of long runs
+        of a larger ring; 48 is usual.
     seed, reference_states
         See `Fit`.
     """
@@ -376,7 +377,7 @@ class PrimedFit(_LossFit):
         return self._named("labels" if self.loss is None else self.loss)
 
     def resolved(self, solver: Solver | None = None, kind: str = "primed") -> PrimedFit:
-        """The same with numbers for all weights."""
+        """The same fit with values for all weights."""
         return replace(self, loss="labels" if self.loss is None else self.loss, **self.weights)
 
     @property
@@ -408,7 +409,7 @@ class PrimedFit(_LossFit):
 class SplitFit(Fit):
     """A split flow of a stiff system, of the exact flows of the parts of H, fitted to the exact flow.
 
-    The label times Δt sin(πj/2J) are dense towards Δt, where polynomials between labels are worst.
+    The label times Δt sin(πj/2J) are dense towards Δt, where polynomials are least accurate between labels.
 
     Parameters
     ----------
@@ -456,15 +457,15 @@ class LossFit(_LossFit):
         Collocation points of each of the first two losses, in a step; by default 700 for Adam, 1500 for Gauss–Newton,
         4000 for BFGS.
     loss : str, optional
-        Some of "residual", "matching" and "labels", joined by "+": those that are left out get the weight 0.
+        Some of "residual", "matching" and "labels", joined by "+"; the others get the weight 0.
     residual_weight, matching_weight, label_weight : float, optional
         Weights of the residual of the flow, Hamiltonian matching, and labels; 0 leaves a loss out. The defaults are 1,
         1 (0 for Gauss–Newton and for a baseline, which has no Hamiltonian), and 0, 1 with `data`.
     matching_times : int
         Number of distinct times in the second, each with points / matching_times states (to remove 𝓗's free c(t)).
     label_times : int
-        Number of equidistant times in (0, Δt] at which as many states as there are points are labelled; each step
-        takes `points` of these labels.
+        Number of equidistant times in (0, Δt]; at each of them `points` states are labelled. Each step uses `points` of
+        these labels.
     data : (array (n,), array (n, 2d), array (n, 2d)), optional
         Labels of your own; a tenth is held out.
     validation_points : int
@@ -575,15 +576,15 @@ class KeplerFit(Fit):
     Parameters
     ----------
     dt : float, optional
-        Δt; by default the longest with an error of at most `tol`, of those up to a quarter of the shortest period.
+        Δt; by default the longest up to a quarter of the shortest period with an error of at most `tol`.
     tol : float
         Relative energy error, where `dt` is left out.
     reach, gradients : int
-        M, the steps to either side of a state over which the processor goes, and the number of its force gradients.
+        The processor takes `reach` steps to either side of a state, and has this number of force gradients.
     points : int
         States along the orbit of `y0`, at random times.
     orbits : float
-        The time over which these are spread, in orbits of the innermost planet.
+        The time over which the points are spread, in periods of the innermost planet.
     seed
         Of these times.
     """

@@ -62,22 +62,22 @@ def train(
     workers: Any = 1,
     **options: Any,
 ) -> Any:
-    """Train a flow map of `system` on [0, Δt]: with nothing else given, the best that is known for it.
+    """Train a flow map of `system` on [0, Δt]: by default the most accurate kind for the system.
 
-    For planets about a star it is a `KeplerFlow`, found in half a minute. For another separable system with
-    T = ½ pᵀM⁻¹p, however V was given, it is a primed flow (`SympFlow.primed`), whose few numbers are fitted to the
-    exact flow in seconds. In up to three degrees of freedom of a symbolic system short trials
-    choose its Δt, and whether its kicks have curvature terms (`sympflow.training.trials`), unless something is said of
-    the flow or its fit. For any other system it is a SympFlow with MLP potentials, symplectic for every H, trained by
-    Adam on its residual and by Hamiltonian matching, without data. The choice is the same on every machine.
+    For planets about a star it is a `KeplerFlow`, found in half a minute. For another separable system with T = ½
+    pᵀM⁻¹p it is a primed flow (`SympFlow.primed`), whose few numbers are fitted to the exact flow in seconds. For
+    symbolic systems of up to three degrees of freedom short trials choose its Δt, and whether its kicks have curvature
+    terms (`sympflow.training.trials`), unless an option of the flow or its fit is given. For any other system it is a
+    SympFlow with MLP potentials, symplectic for every H, trained by Adam on its residual and by Hamiltonian matching,
+    without data. The choice is the same on every machine.
 
     Parameters
     ----------
     system : HamiltonianSystem
-        H, which a flow is fitted to, with `data` as well.
+        The system whose H the flow is fitted to, also if `data` are given.
     fit : Fit, optional
         `PrimedFit`, `SplitFit`, `NetworkFit`, `ClockedFit` and `KeplerFit` of `sympflow.training` make a flow and fit
-        it, `LossFit` trains a given `flow` on losses: their fields are the options. A number is Δt.
+        it; `LossFit` trains a given `flow` on losses. Their fields are the options. A number is Δt.
     flow : FlowMap, optional
         Train a copy of this flow further in place of a new one: one made by `SympFlow.primed` or `SympFlow.split`, say,
         or a second stage with another solver.
@@ -87,25 +87,25 @@ def train(
         By default `GaussNewton()` for primed and split flows, `Adam()` for others, which `GaussNewton` trains far
         better.
     budget : float, optional
-        Stop after so many seconds, to 20 %, and a few seconds for what is imported and compiled. All counts: trials (at
-        most two thirds of it), labels (at most 0.3 of what is left, each set), starts, fits, held-out figures. Where
-        labels take longer the flow is returned as it was, and a warning says how far they came. With a budget a
-        symbolic system of up to three degrees of freedom has as many starts as two fifths of the time allow, up to
-        1000: another flow on another machine. Without one the same call gives the same flow, however long it takes.
+        Stop after so many seconds, to 20 %, and a few seconds for what is imported and compiled. The limit includes
+        trials (at most two thirds of it), labels (each set at most 0.3 of the remaining time), starts, fits and
+        held-out errors. If labels take longer, the flow is returned untrained, with a warning. With a budget a symbolic
+        system of up to three degrees of freedom has as many starts as two fifths of the time allow, up to 1000: so the
+        flow depends on the machine. Without one the same call gives the same flow, however long it takes.
     checkpoint : path, optional
-        Write the state of the run there at intervals, atomically; of a primed flow after each start of the search, and
-        first as soon as there is a run: of one that is killed in the trials nothing is kept.
+        Write the state of the run there at intervals, atomically; for a primed flow after each start of the search.
+        During the trials nothing is written.
     resume : path, optional
-        Go on from this checkpoint, given the same arguments otherwise; the weights end bit-identical to those of a
-        run that was not interrupted.
+        Continue from this checkpoint, with otherwise the same arguments; the weights are bit-identical to those of an
+        uninterrupted run.
     progress : bool, optional
         Show a progress bar; the default is on a terminal only.
     callback : callable, optional
-        callback(step, figures) after each validation; `figures` has the held-out losses and one-step error.
+        callback(step, figures), called after each validation; `figures` has the held-out losses and one-step error.
     workers : int, object with .map, or callable
-        Who follows the starts and fits of `GaussNewton` on a primed or a split flow, and makes the trials: a number of
-        processes, −1 for as many as there are cores, or an engine as for `sympflow.ensemble`. Without a budget the
-        result is the same to the last bit whatever they are.
+        Workers for the trials, starts and fits of `GaussNewton` on a primed or a split flow: a number of processes, −1
+        for as many as there are cores, or an engine as for `sympflow.ensemble`. Without a budget the result does not
+        depend on them, to the last bit.
     **options
         In place of `fit` and `solver` their fields by name, with `dt`, `kind` ("primed", "kepler", "sympflow", a
         network, or "mlp", the baseline), `optimizer` ("gauss-newton", "adam", "bfgs", "lbfgs"), and `time_budget` for
@@ -114,17 +114,17 @@ def train(
     Returns
     -------
     SympFlow or MLPFlow
-        In its best state by the held-out loss, its parameters without gradient; `recipe` and `figures` tell how it
-        was made and what it achieves, `history` the held-out figures over the run. Ctrl-C, a used-up budget and a
+        In its best state by the held-out loss, its parameters without gradient; `recipe` and `figures` describe how it
+        was made and how accurate it is, `history` has the held-out errors over the run. Ctrl-C, a used-up budget and a
         loss that is not finite also end the run with the best state so far, and a warning. Ctrl-C does so within
-        seconds, once there is a state to return: in the trials from the end of the first. A second one raises.
+        seconds, once the first trial is finished. A second Ctrl-C raises KeyboardInterrupt.
 
     Warns
     -----
     UserWarning
-        If the flow is far from the exact one: where its error in one step of Δt is, in the mean over held-out states, a
-        tenth or more of what the step moves a state, coordinates in units of their spread over Ω; or, for a network on
-        a separable system, no less than that of one Verlet step. `figures` has both as "missed_share" and
+        If the flow is far from the exact one: if its error in one step of Δt is at least a tenth of the displacement in
+        that step, in the mean over held-out states and with coordinates in units of their spread over Ω; or, for a
+        network on a separable system, at least that of one Verlet step. `figures` has both as "missed_share" and
         "verlet_missed_share".
 
     Raises
@@ -133,7 +133,7 @@ def train(
         If the system has no domain and none is given, an argument is not admissible, Δt is far beyond the periods of
         the system, or the weights and points would take more memory than the machine has.
     TypeError
-        If an option is not one of the fit or the solver, or of no training at all; the message lists those there are.
+        If the fit or the solver does not have an option; the message lists those it has.
     FloatingPointError
         If the loss is not finite from the start.
     KeyboardInterrupt
