@@ -704,9 +704,9 @@ class SystemFlow(SympFlow, ABC):
             kernels[compensated] = system, flow._compiled_for(system, compensated)
         return kernels[compensated][1]
 
-    @abstractmethod
     def _compiled_for(self, system: HamiltonianSystem, compensated: bool) -> Kernel:
-        """The compiled loops of the flow on a system."""
+        """The compiled loops of the flow on a system; a `NotCompiled` if there are none, as here."""
+        raise arrays_only(f"`flow` of kind {self.PLAN!r} has no compiled loops")
 
 
 def _drive_of(told: Any) -> Drive | None:

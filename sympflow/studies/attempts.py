@@ -361,6 +361,7 @@ class Measure:
     title: str
     figures: tuple[str, ...]  # the second, if any, is the uncertainty of the first
     of: Callable[[Attempt], Any]
+    conserved: bool = True  # False for one that damped systems have too
 
     def cell(self, row: Row) -> str:
         """The figures of a row in a table."""
@@ -427,8 +428,8 @@ MEASURES = {  # the metrics by their names, in the order of their columns
     "drift": Measure("drift per unit t", ("energy_drift", "energy_drift_error"), drift),
     "volume": Measure("volume error", ("volume_error",), volume),
     "symplecticity": Measure("sympl. defect", ("symplecticity_defect",), partial(defect, of=symplecticity_defect)),
-    "conformal": Measure("conf. defect", ("conformal_defect",), partial(defect, of=conformal_defect)),
-    "reversal": Measure("reversal", ("time_reversal_error",), reversal),
+    "conformal": Measure("conf. defect", ("conformal_defect",), partial(defect, of=conformal_defect), False),
+    "reversal": Measure("reversal", ("time_reversal_error",), reversal, False),
 }
 OF_MEASURES = tuple(name for measure in MEASURES.values() for name in measure.figures)
 FIGURES = {"error", "domain_exit", *OF_MEASURES}

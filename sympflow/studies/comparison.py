@@ -176,7 +176,7 @@ def default_metrics(system: HamiltonianSystem) -> tuple[str, ...]:
 
 def _check_apply(system: HamiltonianSystem, asked: Sequence[str], match: str | None) -> None:
     """Refuse metrics of what the flow of a system does not keep."""
-    unkept = [m for m in asked if m not in ("error", "reversal", "conformal")]
+    unkept = [m for m in asked if m != "error" and MEASURES[m].conserved]
     if unkept or match == "energy_error":
         what = f"which `metrics` {', '.join(map(repr, unkept))}" if unkept else "which `match` 'energy_error'"
         remedy = f"leave `metrics` out, or pass {list(default_metrics(system))}, and match by 'time'"

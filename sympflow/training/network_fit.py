@@ -18,7 +18,7 @@ from sympflow.hamiltonian.exact_flow import reference_step
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.training.fits import Adam, Resolved, Solver
 from sympflow.training.losses import Loss, Objective
-from sympflow.training.optimizers import MEMORY, optimizer
+from sympflow.training.optimizers import MEMORY, STEPS
 from sympflow.training.points import (
     BLOCK,
     Labelled,
@@ -55,7 +55,7 @@ class LossRun(Run):
         """Draw fresh points."""
         flow, system, domain, fit, solver = self.flow, self.system, self.domain, self.fit, self.solver
         self.best: dict[str, Tensor] = {}
-        self.optimizer = optimizer(flow, solver)
+        self.optimizer = STEPS[solver.name](flow, solver)
         _check_memory(flow, fit, solver)
         data: Labelled | None = fit.data
         self.loss = Loss(system, self.scaling, fit.residual_weight, fit.matching_weight, fit.label_weight)

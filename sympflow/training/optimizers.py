@@ -14,7 +14,6 @@ from torch import Tensor
 
 from sympflow.flow.flow_map import FlowMap
 from sympflow.training import fits
-from sympflow.training.fits import Solver
 from sympflow.training.least_squares import GaussNewtonSteps, check_parameters, put_weights, weight_vector
 from sympflow.training.session import OutOfTime
 
@@ -202,10 +201,10 @@ Optimizer = AdamSteps | LBFGSSteps | BFGSSteps | GaussNewtonSteps
 """A method whose `step` lowers an objective of the flow that it was made for, and returns the loss before it."""
 
 
-def optimizer(flow: FlowMap, solver: Solver) -> Optimizer:
-    """The optimizer of a flow that a solver describes."""
-    if isinstance(solver, fits.Adam):
-        return AdamSteps(flow, solver)
-    made: dict[str, Callable[[FlowMap], Optimizer]]
-    made = {"bfgs": BFGSSteps, "lbfgs": LBFGSSteps, "gauss-newton": GaussNewtonSteps}
-    return made[solver.name](flow)
+STEPS: dict[str, Callable[[FlowMap, Any], Optimizer]] = {
+    "adam": AdamSteps,
+    "bfgs": lambda flow, options: BFGSSteps(flow),
+    "lbfgs": lambda flow, options: LBFGSSteps(flow),
+    "gauss-newton": lambda flow, options: GaussNewtonSteps(flow),
+}
+"""The optimizers of a flow by the names of the solvers that describe them."""
