@@ -256,9 +256,9 @@ def _check_memory(flow: FlowMap, fit: Resolved, solver: Solver) -> None:
     if fit.label_weight and fit.data is None:
         of_points += (fit.points + fit.validation_points) * fit.label_times * width
     check_memory(f"`points` {fit.points} and `validation_points`", of_points, "take fewer")
-    kept = {"adam": 4 * n, "lbfgs": 2 * MEMORY * n, "bfgs": 3 * n**2, "gauss-newton": 3 * n * (fit.points * width + n)}
+    kept = {"lbfgs": 2 * MEMORY * n, "bfgs": 3 * n**2, "gauss-newton": 3 * n * (fit.points * width + n)}
     smaller = "take fewer `points`, a smaller network, or optimizer='adam'"
-    check_memory(f"`optimizer` {solver.name!r} of {n} parameters", kept[solver.name], smaller)
+    check_memory(f"`optimizer` {solver.name!r} of {n} parameters", kept.get(solver.name, 4 * n), smaller)
 
 
 def _first(points: Points, n: int) -> Points:
