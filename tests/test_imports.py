@@ -19,12 +19,18 @@ ALLOWED = [
     "for H in 'p**2/2 + q**2/2 + q**4/4', 'p**2/2 + exp(-2*q) - 2*exp(-q)', 'p**2/2 - cos(q)/3 + sqrt(1 + q**2)':\n"
     "    system = sympflow.HamiltonianSystem.from_sympy(H, y0=[0.5, 0.0])\n"
     "    assert sympflow.solve(system, 'verlet', (0, 1), dt=0.1).stats['backend'] == 'compiled'\n"
-    "for scene in sympflow.systems.pendulum, sympflow.systems.quartic, sympflow.systems.henon_heiles:\n"
+    "for H, params in ('p**2/(2*m) + k*q**2/2 - g*cos(q)', dict(m=2.0, k=0.5, g=0.3)), "
+    "('p**2/2 + k/q + q**2', dict(k=1.5)):\n"
+    "    system = sympflow.HamiltonianSystem.from_sympy(H, params=params, y0=[0.5, 0.0])\n"
+    "    for of in system, system.with_params(k=0.7):\n"
+    "        assert sympflow.solve(of, 'verlet', (0, 0.1), dt=0.01).stats['backend'] == 'compiled'\n"
+    "    assert sympflow.solve(system, 'verlet', (0, 0.1), params={'k': [0.4, 1.0]}, dt=0.01).energy().shape == (2, 11)\n"
+    "for scene in sympflow.systems.pendulum, sympflow.systems.kepler, sympflow.systems.henon_heiles:\n"
     "    for method in 'srkn11b', 'gauss_legendre4', 'rk4', 'verlet':\n"
     "        assert sympflow.solve(scene(), method, (0, 1), dt=0.1).stats['backend'] == 'compiled'\n"
     "    sympflow.solve(scene(), 'verlet', (0, 1), backend='array').energy()\n"
     "    assert scene().hessian(scene().y0) is not None",
-    "for scene in sympflow.systems.pendulum, sympflow.systems.quartic, sympflow.systems.henon_heiles:\n"
+    "for scene in sympflow.systems.pendulum, sympflow.systems.kepler, sympflow.systems.henon_heiles:\n"
     "    assert sympflow.solve(scene(), 'sympflow', (0, 10)).stats['backend'] == 'compiled'",
     "import sympflow; sympflow.systems.henon_heiles().expression",
     "import sympflow\nsympflow.available(); sympflow.shipped_flows()",

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from sympflow.arrays import Array, assemble, beside, is_tensor
+from sympflow.compiler.arrange import Arrangement
 from sympflow.compiler.functions import apply, is_zero, where
 from sympflow.compiler.program import (
     CONDITIONS,
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
 
 MOST_IN_SYMBOLS = 300  # operations
 MOST_COMPILED = 5000  # operations of a gradient
+DOUBLE = 1e-6  # share by which two roots of a polynomial that are one may differ
 _JUMPING = {"sign", "floor", "mod", "where", "lt", "le", "eq", "atan2"}
 _BENDING = {"abs", "min", "max", "asin", "acos", "acosh", "sqrt", "pow"}
 _OF_FIRST = "pow log log1p tan sqrt acos asin acosh atanh gamma lgamma digamma ellipk bose csch"
@@ -346,9 +348,8 @@ class TracedPoles:
             if g.name in _AS_THEIR_ARGUMENTS:
                 for x in g.args:
                     self._add(x)
-            elif (ends := _between_roots(g)) is not None:
-                for x in ends:
-                    self._add(x)
+            elif (ends := _between_roots(g) or self._at_roots(g)) is not None:
+                self._vanishing |= {x.order: x for x in ends}
             elif _least(g) < POSITIVE:
                 self._vanishing[g.order] = g
                 within = {x.order for x in reached([g])}
@@ -358,6 +359,19 @@ class TracedPoles:
                         at_zero = Program(used, [g])(np.float64(0.0))[0]
                     if at_zero == 0.0:  # which it may touch
                         self._add(used[0])
+
+    def _at_roots(self, g: Traced) -> list[Traced] | None:
+        """The x − a of the real roots a of a polynomial in one number, None of what is none."""
+        within = {x.order for x in reached([g])}
+        x, *others = [x for x in self._form.H.program.inputs if x.order in within]
+        polynomial = Program([x], [g])
+        if others or not Formula(polynomial, [Variable(repr(x))]).is_polynomial():
+            return None
+        made = Arrangement([(repr(x), 0)])
+        terms = {sum(e for _, e in m): c for m, c in made.number(polynomial(*made.states)[0]).terms.items()}
+        roots = np.roots([terms.get(n, 0.0) for n in range(max(terms, default=0), -1, -1)])
+        real = roots.real[np.abs(roots.imag) <= DOUBLE * np.abs(roots)]  # two that are one come in a pair
+        return [x - a for a in np.unique(real).tolist()]
 
     def may_pass(self, y: np.ndarray) -> bool:
         """Return True: signs and H are looked at in all runs."""
@@ -382,14 +396,16 @@ class TracedPoles:
 
 def _between_roots(g: Traced) -> tuple[Any, Any] | None:
     """The x − a and x + a of x² − a²."""
-    if g.name != "sub" or not isinstance(g.args[1], float) or g.args[1] <= 0:
-        return None
-    square, a = g.args[0], math.sqrt(g.args[1])
-    if not (isinstance(square, Traced) and square.name in ("pow", "mul")):
+    square, number = g.args if g.name == "sub" else (g.args[1], -g.args[0]) if _is_sum_with_number(g) else (None, 0.0)
+    if not (isinstance(number, float) and number > 0 and isinstance(square, Traced) and square.name in ("pow", "mul")):
         return None
     x, other = square.args
     is_square = other is x if square.name == "mul" else isinstance(other, float) and other == 2
-    return (x - a, x + a) if is_square else None
+    return (x - math.sqrt(number), x + math.sqrt(number)) if is_square else None
+
+
+def _is_sum_with_number(g: Traced) -> bool:
+    return g.name == "add" and isinstance(g.args[0], float)
 
 
 _TOUCHING = {"cos": (math.pi, 0.0), "sin": (math.pi / 2, -math.pi / 2), "cosh": (0.0, 0.0)}

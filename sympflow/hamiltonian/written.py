@@ -136,9 +136,10 @@ class _Reader:
             raise NotPlain
         if not whole and base.name not in ("input", "add", "sub"):  # as √x², which is |x|
             raise NotPlain
-        if not (whole and exponent > 0) and not ARITHMETIC.issuperset(x.name for x in reached([base])):
+        radicand, exponent = (base.args[0], exponent / 2) if base.name == "sqrt" else (base, exponent)
+        if not (whole and exponent > 0) and not ARITHMETIC.issuperset(x.name for x in reached([radicand])):
             raise NotPlain  # functions may overflow, or cancel, as 1 − cos x
-        x = apply("pow", base.args[0], -0.5) if base.name == "sqrt" else apply("pow", base, float(exponent))
+        x = apply("pow", radicand, float(exponent))
         return self._marked(x, [base], exponent < 0)
 
     def _call(self, name: str, x: Any) -> Any:
@@ -296,8 +297,8 @@ class WrittenHamiltonian(Definition):
         return self.form.written
 
     @cached_property
-    def poles(self) -> Any:
-        return self.symbols.poles if TracedPoles(self.form) else None
+    def poles(self) -> TracedPoles | None:
+        return TracedPoles(self.form) or None
 
     _generated = ("poles", "parametric")
 

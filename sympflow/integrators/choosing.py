@@ -135,7 +135,9 @@ def _attractive_pole(system: HamiltonianSystem, states: bytes) -> tuple[str, boo
 def _centers(system: HamiltonianSystem, q: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
     """Names and positions (n, d) of the zeros that are next to positions q of what vanishes where H is infinite."""
     yield "q = 0" if system.local is None else "r = 0", np.zeros_like(q)
-    poles, d = system.definition.poles, system.ndof
+    poles, d = system.definition.poles and system.definition.poles.exact, system.ndof
+    if poles is None:
+        return
 
     def sizes(x: np.ndarray) -> np.ndarray:
         return poles.sizes(np.concatenate([x, 0 * x], axis=-1), np.zeros(x.shape[:-1]))
