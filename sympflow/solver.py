@@ -462,9 +462,9 @@ def _solved_followed(integrator: Integrator, problem: Problem, action: str, rows
     """The solution of trajectories to whose parameters gradients flow: one run, whatever the values."""
     numbers = {name: as_tensor(value.copy()) for name, value in rows.values.items() if name not in rows.followed}
     followed = {name: rows.followed[name] if name in rows.followed else numbers[name] for name in rows.values}
-    letters = None if problem.system.local is None else problem.system.local.letters(followed)
-    if letters is not None:
-        followed = {name: as_tensor(x) for name, x in letters.items()}
+    by_name = None if problem.system.local is None else problem.system.local.parameter_values(followed)
+    if by_name is not None:
+        followed = {name: as_tensor(x) for name, x in by_name.items()}
     columns = [np.broadcast_to(to_numpy(value), rows.shape) for value in followed.values()]
     parameter_values = np.array([np.ravel(value) for value in columns])
     together = replace(problem, parameter_values=parameter_values, followed=followed, diagnosed=False)

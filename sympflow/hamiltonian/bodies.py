@@ -198,8 +198,8 @@ class PairsHamiltonian(LocalHamiltonian):
             self._set_inertia()
         self._check_continuous()
 
-    def letters(self, numbers: Mapping[str, Any]) -> dict[str, Any]:
-        """All that a pair and the drifts depend on, by letters: of the parameters and masses in `numbers` these."""
+    def parameter_values(self, numbers: Mapping[str, Any]) -> dict[str, Any]:
+        """All that a pair and the drifts depend on, by symbols: of the parameters and masses in `numbers` these."""
         names = [*self.params, *self.c[len(self.params) :]][: len(self.c)]  # an `extra` potential has more
         found = {c.name: numbers.get(n, x) for n, c, x in zip(names, self.c, self.constants, strict=True)}
         found["softening"] = self.softening**2
@@ -226,14 +226,14 @@ class PairsHamiltonian(LocalHamiltonian):
         if self.box is not None or self.cutoff is not None or pairs > MOST_SPELLED_PAIRS:
             return None
         q, p = (sp.symbols(f"{name}1:{self.ndof + 1}", real=True) for name in "qp")
-        values = self.letters({})
-        letters = {name: sp.Symbol(name, real=True) for name in values}
-        T = sp.Add(*(letters[f"w_{i // self.dim}"] * x**2 / 2 for i, x in enumerate(p)))
-        columns = [[letters[f"column_{i}_{k}"] for k in range(self.n_bodies)] for i in range(len(self.columns))]
-        softening = letters["softening"] if self.softening else sp.S.Zero
-        V = self.written_potential(q, softening, columns, {c: letters[c.name] for c in self.c})
+        values = self.parameter_values({})
+        symbols = {name: sp.Symbol(name, real=True) for name in values}
+        T = sp.Add(*(symbols[f"w_{i // self.dim}"] * x**2 / 2 for i, x in enumerate(p)))
+        columns = [[symbols[f"column_{i}_{k}"] for k in range(self.n_bodies)] for i in range(len(self.columns))]
+        softening = symbols["softening"] if self.softening else sp.S.Zero
+        V = self.written_potential(q, softening, columns, {c: symbols[c.name] for c in self.c})
         H = T + V
-        return SymbolicHamiltonian(H, {name: values[name] for name, s in letters.items() if s in H.free_symbols})
+        return SymbolicHamiltonian(H, {name: values[name] for name, s in symbols.items() if s in H.free_symbols})
 
     def written_potential(
         self,

@@ -451,7 +451,7 @@ def _least(x: Any) -> int:
 
 
 class TracedDriving:
-    """Letters of a traced V that depend on the time alone, and V in these; those of T, `means`, are none."""
+    """Coefficients of a traced V that depend on the time alone, and V in these; those of T, `means`, are none."""
 
     means: tuple[()] = ()
 
@@ -470,18 +470,18 @@ class TracedDriving:
         """Do nothing: all that was traced has a compiled form."""
 
 
-class TracedLetters:
+class TracedCoefficients:
     """Formulas with coefficients for what depends on the time alone, `given` those of parameters too."""
 
     def __init__(self, form: TracedHamiltonian, expressions: Sequence[Formula]) -> None:
-        self.symbols, self.expressions, self.letters = form, list(expressions), dict[Variable, Formula]()
+        self.symbols, self.expressions, self.time_coefficients = form, list(expressions), dict[Variable, Formula]()
         if form.time is not None:
-            self.expressions, self.letters = without_time(expressions, form.time)
-        self.given = (*form.parameters, *self.letters)
+            self.expressions, self.time_coefficients = without_time(expressions, form.time)
+        self.given = (*form.parameters, *self.time_coefficients)
 
     def at(self, t: Any, parameters: Sequence[Any]) -> list[Any]:
         """The coefficients at times t."""
-        return _at_time(self.letters, t)
+        return _at_time(self.time_coefficients, t)
 
 
 def _at_time(coefficients: Mapping[Variable, Formula], time: Any) -> list[Any]:

@@ -70,7 +70,7 @@ class LocalHamiltonian(Definition, ABC):
         """Values of parameters, each with one for each trajectory at most."""
         return dict(params)
 
-    def letters(self, numbers: Mapping[str, Any]) -> dict[str, Any] | None:
+    def parameter_values(self, numbers: Mapping[str, Any]) -> dict[str, Any] | None:
         """The numbers of compiled code through which gradients flow to `numbers` of parameters, if they do."""
         return None
 

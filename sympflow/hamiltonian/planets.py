@@ -334,15 +334,15 @@ class PlanetsHamiltonian(PairsHamiltonian):
             if more:
                 raise ValueError("`params` are those of `extra`, which is not given: leave them out.")
             return
-        self._letters = dict(zip(("G", "m", *more), numbered("c", ("G", "m", *more)), strict=True))
-        names = {**{name: sp.Symbol(name, real=True) for name in PLACE}, **self._letters}
+        self._extra_symbols = dict(zip(("G", "m", *more), numbered("c", ("G", "m", *more)), strict=True))
+        names = {**{name: sp.Symbol(name, real=True) for name in PLACE}, **self._extra_symbols}
         if len(names) < len(PLACE) + 2 + len(more):
             taken = next(name for name in more if name in (*PLACE, "G", "m"))
             raise ValueError(f"`params` gives a value to {taken!r}, which `extra` has already: rename it.")
         self.extra = parsed("extra", extra, names, "-3*(G*m/(c*r))**2")
         self._places = [names[name] for name in PLACE]
         for name in more:
-            if self._letters[name] not in self.extra.free_symbols:
+            if self._extra_symbols[name] not in self.extra.free_symbols:
                 raise ValueError(f"`params` has {name!r}, which `extra` does not use: remove it.")
         if not self.extra.free_symbols & {*self._places}:
             raise ValueError(f"`extra` must depend on {', '.join(PLACE)}, the place of a body; got {self.extra}.")
@@ -352,15 +352,15 @@ class PlanetsHamiltonian(PairsHamiltonian):
 
     def _check_continuous(self) -> None:
         if self.extra is not None:
-            values = dict(zip(self._letters.values(), self.extra_values, strict=True))
-            names = {letter: name for name, letter in self._letters.items()}
+            values = dict(zip(self._extra_symbols.values(), self.extra_values, strict=True))
+            names = {letter: name for name, letter in self._extra_symbols.items()}
             check_continuous("extra", self.extra, self._places, values, names)
 
     @property
     def extra_values(self) -> list[float]:
         """The numbers that `extra_program` takes after the place."""
         given = {**self.params, "m": float(self.masses[0])}
-        return [given[name] for name in self._letters]
+        return [given[name] for name in self._extra_symbols]
 
     def extra_program(self, order: int) -> Program:
         """The extra potential of a body at x, y, z from the star, with order 0; its slope, and along vectors that.
@@ -368,12 +368,12 @@ class PlanetsHamiltonian(PairsHamiltonian):
         The numbers are x, y, z, those of `extra_values`, and the vectors.
         """
         if order not in self._programs:
-            names = [*PLACE[:3], *self._letters, *(f"{name}{k}" for k in range(1, order) for name in PLACE[:3])]
+            names = [*PLACE[:3], *self._extra_symbols, *(f"{name}{k}" for k in range(1, order) for name in PLACE[:3])]
 
             def values(*numbers: Any) -> list[Any]:
-                x, end = numbers[:3], 3 + len(self._letters)
+                x, end = numbers[:3], 3 + len(self._extra_symbols)
                 r = apply("sqrt", x[0] * x[0] + x[1] * x[1] + x[2] * x[2])
-                known = zip([*self._places, *self._letters.values()], [*x, r, *numbers[3:end]], strict=True)
+                known = zip([*self._places, *self._extra_symbols.values()], [*x, r, *numbers[3:end]], strict=True)
                 found = [1.0 * evaluator(dict(known))(self.extra)]
                 if order:
                     found = gradient(found[0], x)
@@ -419,9 +419,9 @@ class PlanetsHamiltonian(PairsHamiltonian):
         few = self.ndof <= MOST_SPELLED and self.n_bodies * (self.n_bodies - 1) // 2 <= MOST_SPELLED_PAIRS
         return "" if self.extra is None or few else "an `extra` potential of many bodies"
 
-    def letters(self, numbers: Mapping[str, Any]) -> dict[str, Any]:
-        own = [] if self.extra is None else [name for name in self._letters if name not in ("G", "m")]
-        return super().letters(numbers) | {f"{name}_": numbers.get(name, self.params[name]) for name in own}
+    def parameter_values(self, numbers: Mapping[str, Any]) -> dict[str, Any]:
+        own = [] if self.extra is None else [name for name in self._extra_symbols if name not in ("G", "m")]
+        return super().parameter_values(numbers) | {f"{name}_": numbers.get(name, self.params[name]) for name in own}
 
     def written_potential(
         self,
@@ -434,8 +434,8 @@ class PlanetsHamiltonian(PairsHamiltonian):
         V = super().written_potential(q, softening, columns, c, box)
         if self.extra is None:
             return V
-        own = {letter: sp.Symbol(f"{name}_", real=True) for name, letter in self._letters.items()}
-        own |= {self._letters["G"]: c[self.c[0]], self._letters["m"]: columns[0][0]}
+        own = {letter: sp.Symbol(f"{name}_", real=True) for name, letter in self._extra_symbols.items()}
+        own |= {self._extra_symbols["G"]: c[self.c[0]], self._extra_symbols["m"]: columns[0][0]}
         for i in range(1, self.n_bodies):
             x = [q[3 * i + k] - q[k] for k in range(3)]
             put = dict(zip(self._places, (*x, sp.sqrt(sp.Add(*(y**2 for y in x)))), strict=True))

@@ -90,7 +90,7 @@ def _followed_loops(make: Callable[[tuple[str, ...]], Any], problem: Problem) ->
     """The compiled loops, that `make` gives for names, of a run through which gradients flow to parameters."""
     local = problem.system.local
     try:
-        if not problem.system.definition.symbolic and (local is None or local.letters({}) is None):
+        if not problem.system.definition.symbolic and (local is None or local.parameter_values({}) is None):
             raise NotCompiled(f"`system` {problem.system.name!r} is not symbolic.")
         return _loops_by_values(make, problem, problem.system)
     except NotCompiled as error:

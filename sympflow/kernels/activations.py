@@ -9,7 +9,7 @@ from typing import Any
 from sympflow.compiler.functions import apply, fma
 from sympflow.compiler.program import Program, fused, gradient, traced
 
-__all__ = ["SIGMAS", "bent"]
+__all__ = ["SIGMAS", "activation_program"]
 
 
 def _logistic(a: Any) -> Any:
@@ -26,7 +26,7 @@ SIGMAS: dict[str, Callable[[Any], Any]] = {
 
 
 @cache
-def bent(name: str, orders: int) -> Program:
+def activation_program(name: str, orders: int) -> Program:
     """Return the program of σ(a), σ'(a), σ''(a) …, so many derivatives."""
     program = traced(lambda a: [SIGMAS[name](a)], "a")
     found = list(program.outputs)

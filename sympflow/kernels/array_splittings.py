@@ -38,10 +38,12 @@ class Forces(ABC):
         self._mass = inverse_mass
 
     @abstractmethod
-    def sum(self, order: int, room: Room, given: Sequence[Rows], out: Rows, d: Value, letters: Sequence[Any]) -> None:
+    def sum(
+        self, order: int, room: Room, given: Sequence[Rows], out: Rows, d: Value, coefficients: Sequence[Any]
+    ) -> None:
         """∇V(q), ∇²V(q) v and ½ ∇³V(q)(v, v) of places q and v in memory, by the order 0, 1, 2, into another one."""
 
-    def velocity(self, room: Room, p: Rows, out: Rows, d: Value, letters: Sequence[Any]) -> None:
+    def velocity(self, room: Room, p: Rows, out: Rows, d: Value, coefficients: Sequence[Any]) -> None:
         """∇T(p)."""
         code, M = room.code, self._mass
         masses = None if M is None else room.data(len(self.data) - 1)
@@ -66,23 +68,33 @@ class TermForces(Forces):
         self._V, self._T = V, T
         self.data = [*V.data, *([] if T is None else [T] if isinstance(T, np.ndarray) else T.data)]
 
-    def sum(self, order: int, room: Room, given: Sequence[Rows], out: Rows, d: Value, letters: Sequence[Any]) -> None:
-        self._add(self._V, 0, order, room, given, out, d, letters)
+    def sum(
+        self, order: int, room: Room, given: Sequence[Rows], out: Rows, d: Value, coefficients: Sequence[Any]
+    ) -> None:
+        self._add(self._V, 0, order, room, given, out, d, coefficients)
 
-    def velocity(self, room: Room, p: Rows, out: Rows, d: Value, letters: Sequence[Any]) -> None:
+    def velocity(self, room: Room, p: Rows, out: Rows, d: Value, coefficients: Sequence[Any]) -> None:
         if self._T is None or isinstance(self._T, np.ndarray):
-            super().velocity(room, p, out, d, letters)
+            super().velocity(room, p, out, d, coefficients)
         else:
-            self._add(self._T, len(self._V.data), 0, room, [p], out, d, letters)
+            self._add(self._T, len(self._V.data), 0, room, [p], out, d, coefficients)
 
     def _add(
-        self, terms: Terms, first: int, order: int, room: Room, given: Any, out: Rows, d: Value, letters: Sequence[Any]
+        self,
+        terms: Terms,
+        first: int,
+        order: int,
+        room: Room,
+        given: Any,
+        out: Rows,
+        d: Value,
+        coefficients: Sequence[Any],
     ) -> None:
         """Write derivatives of terms, whose arrays are those from the `first` on, into another place in memory."""
         with room.code.over(d) as i:
             out[i] = 0.0
         data = [room.data(first + k) for k in range(len(terms.data))]
-        terms.add(data, terms.derivatives(order), given, letters, lambda places: [(out, i) for i in places])
+        terms.add(data, terms.derivatives(order), given, coefficients, lambda places: [(out, i) for i in places])
 
 
 class Functions(Forces):
@@ -102,12 +114,14 @@ class Functions(Forces):
     def __reduce__(self) -> tuple[Any, ...]:
         return Functions, self._given
 
-    def sum(self, order: int, room: Room, given: Sequence[Rows], out: Rows, d: Value, letters: Sequence[Any]) -> None:
+    def sum(
+        self, order: int, room: Room, given: Sequence[Rows], out: Rows, d: Value, coefficients: Sequence[Any]
+    ) -> None:
         code = room.code
         with code.over(d) as i:
             out[i] = float("nan")  # what a function does not write ends the run
         address = code.load(room.data(0), order, POINTER)
-        time = letters[0] if letters else code.constant(0.0)
+        time = coefficients[0] if coefficients else code.constant(0.0)
         code.call(address.name, [time, given[0].place, given[-1].place, out.place, d])
 
 
@@ -210,23 +224,23 @@ class ArrayCode(SplittingCode):
         """Write a kick of so many terms, by the numbers of a column."""
         splitting, code, forces = self._splitting, room.code, self._forces
         d, kicks = self._ndof(room), given[1 : 1 + len(splitting.kick_numbers)]
-        letters = self._letters(given)
+        coefficients = self._coefficients(given)
         q, p = room, room.part(d)
-        slope, velocity, product, bent = (room.work.part(d * i) for i in range(ARRAYS))
-        forces.sum(0, room, [q], slope, d, letters)
+        slope, velocity, product, third = (room.work.part(d * i) for i in range(ARRAYS))
+        forces.sum(0, room, [q], slope, d, coefficients)
         factors = [(-kicks[0], slope)]
         if terms > 1:
-            forces.velocity(room, slope, velocity, d, letters)
-            forces.sum(1, room, [q, velocity], product, d, letters)
+            forces.velocity(room, slope, velocity, d, coefficients)
+            forces.sum(1, room, [q, velocity], product, d, coefficients)
             factors.append((kicks[1], product))
         if terms > 2:
-            forces.sum(2, room, [q, velocity], bent, d, letters)
+            forces.sum(2, room, [q, velocity], third, d, coefficients)
             with code.over(d) as i:
-                bend = kicks[2] * bent[i]
+                curvature = kicks[2] * third[i]
                 change = fma(kicks[1], product[i], -(kicks[0] * slope[i]))
-                slope[i] = change - bend
-            forces.velocity(room, product, velocity, d, letters)
-            forces.sum(1, room, [q, velocity], product, d, letters)
+                slope[i] = change - curvature
+            forces.velocity(room, product, velocity, d, coefficients)
+            forces.sum(1, room, [q, velocity], product, d, coefficients)
             factors = [(1.0, slope), (-kicks[2], product)]
         if splitting.monomials:
             self._store_polynomial(room, velocity, kicks)
@@ -266,7 +280,7 @@ class ArrayCode(SplittingCode):
             for i, k in self._each(room, d, n):
                 spread[i], p[i] = mean[k] * p[i], decay[k] * p[i]
             moved, a = spread, 1.0
-        forces.velocity(room, moved, velocity, d, self._letters(given))
+        forces.velocity(room, moved, velocity, d, self._coefficients(given))
         with code.over(d) as i:
             self._move(room, q, i, [(a, velocity[i])], 2)
 
@@ -292,7 +306,7 @@ class ArrayCode(SplittingCode):
             corrected = fma(factor, change, corrected)
         x[i], left[i] = added(old, corrected)
 
-    def _letters(self, given: Sequence[Any]) -> Sequence[Any]:
+    def _coefficients(self, given: Sequence[Any]) -> Sequence[Any]:
         return given[len(given) - len(self._splitting.parameters) :]
 
     def _ndof(self, room: Room) -> Value:

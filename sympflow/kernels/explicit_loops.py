@@ -92,7 +92,7 @@ class Field:
 
     @cached_property
     def program(self) -> Program:
-        """f, from q, p, the parameters, the letters and the numbers of Γ."""
+        """f, from q, p, the parameters, the coefficients and the numbers of Γ."""
         symbols, d, n = self.lettered.symbols, self.ndof, 2 * self.ndof
         rates = [Variable(f"rate_{i}") for i in range(len(self.rates))]
         inputs = (*symbols.q, *symbols.p, *self.lettered.given, *rates)
@@ -112,24 +112,24 @@ class Field:
         y, out, time, numbers, room, data = code.arguments
         k, n = len(lettered.symbols.parameters), 2 * self.ndof
         given = [code.load(numbers, i) for i in range(k)]
-        if lettered.letters:
+        if lettered.time_coefficients:
             given += lettered.at(code.load(time), given)
         if self.large:
-            letters = code.at(room, n)
+            coefficients = code.at(room, n)
             for i, x in enumerate(given):
-                code.store(code.operand(x, DOUBLE), letters, i)
+                code.store(code.operand(x, DOUBLE), coefficients, i)
             arrays = [code.load(data, i, POINTER) for i in range(len(self.data))]
-            code.outlined("field", [y, out, room, letters, *arrays], self.fill, rare=False)
+            code.outlined("field", [y, out, room, coefficients, *arrays], self.fill, rare=False)
         else:
             rates = [code.load(numbers, k + i) for i in range(len(self.rates))]
             for i, x in enumerate(self.program(*(code.load(y, i) for i in range(n)), *given, *rates)):
                 code.store(code.operand(x, DOUBLE), out, i)
         return finished(code)
 
-    def fill(self, y: Value, out: Value, g: Value, letters: Value, *data: Value) -> None:
+    def fill(self, y: Value, out: Value, g: Value, coefficients: Value, *data: Value) -> None:
         """f(y) into `out` by loops over the terms of each kind; `g` is room for ∇H."""
         code, d, n = y.code, self.ndof, 2 * self.ndof
-        given = [code.load(letters, k) for k in range(len(self.lettered.given))]
+        given = [code.load(coefficients, k) for k in range(len(self.lettered.given))]
         with code.over(n) as m:
             code.store(code.constant(0.0), g, m)
         slope = Rows(g, DOUBLE)
@@ -175,8 +175,8 @@ class _InRegisters(_Explicit):
         given, rates = column[1 : 1 + self.parameters], column[self.size - len(self.field.rates) :]
         K: list[list[Any]] = []
         for row in self.A:
-            letters = self.letters_at(column, sum(row))
-            K.append(self.field.program(*_moved(state, column[0], row, K), *given, *letters, *rates))
+            coefficients = self.coefficients_at(column, sum(row))
+            K.append(self.field.program(*_moved(state, column[0], row, K), *given, *coefficients, *rates))
         return _moved(state, column[0], self.B, K)
 
     @property
@@ -197,13 +197,13 @@ class _InMemory(_Explicit):
     def stage(self, room: Room, numbers: Numbers, kind: Value, step: Value) -> None:  # type: ignore[override]
         code, n, s = room.code, self.n_out, len(self.B)
         column = self.column(code, numbers, step)
-        *K, Y, g, letters = (room.work.part(n * i) for i in range(s + 3))
+        *K, Y, g, coefficients = (room.work.part(n * i) for i in range(s + 3))
         data = [room.data(i) for i in range(len(self.data))]
         for i, row in enumerate(self.A):
-            for k, x in enumerate([*column[1 : 1 + self.parameters], *self.letters_at(column, sum(row))]):
-                letters[k] = x
+            for k, x in enumerate([*column[1 : 1 + self.parameters], *self.coefficients_at(column, sum(row))]):
+                coefficients[k] = x
             self._move(room, Y, column[0], row, K)
-            places = [x.place for x in (Y, K[i], g, letters)]
+            places = [x.place for x in (Y, K[i], g, coefficients)]
             code.outlined("field", [*places, *data], self.field.fill, rare=False)
         self._move(room, room, column[0], self.B, K)
 

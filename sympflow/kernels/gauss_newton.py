@@ -17,7 +17,7 @@ from sympflow.compiler.functions import apply, fma
 from sympflow.compiler.machine import address
 from sympflow.kernels.runs import begun, finished
 
-__all__ = ["bent", "damped", "factored"]
+__all__ = ["damped", "factored", "geodesic_acceleration"]
 
 WIDTHS = 32, 8, 1  # numbers that are added up together: as many as there are left
 CHUNK = 128  # rows that are folded together
@@ -55,7 +55,7 @@ def damped(R: np.ndarray, D: np.ndarray, damping: float) -> tuple[np.ndarray, np
     return S, step[:n], float(step[n])
 
 
-def bent(
+def geodesic_acceleration(
     columns: np.ndarray,
     blocks: np.ndarray,
     r: np.ndarray,
@@ -68,10 +68,10 @@ def bent(
 ) -> np.ndarray:
     """Return the geodesic acceleration, from the errors `probed` a share `probe` of the step away; 0 if too large."""
     (k, m), n = columns.shape, len(D)
-    curvature, bend = probed - r, np.zeros(n)
-    arrays = columns, blocks, curvature, step, S, D, bend
-    _function("bend")(*map(address, arrays), probe, curved, k, m, len(blocks), n)
-    return bend
+    curvature, acceleration = probed - r, np.zeros(n)
+    arrays = columns, blocks, curvature, step, S, D, acceleration
+    _function("acceleration")(*map(address, arrays), probe, curved, k, m, len(blocks), n)
+    return acceleration
 
 
 # code ---------------------------------------------------------------------------------------------------------------
@@ -190,9 +190,9 @@ def _solve(S: Value, x: Value, n: Value) -> None:
         code.store((code.load(x, i) - known) / code.load(row), x, i)
 
 
-def _bent(code: Code) -> None:
-    """See `bent`: −(SᵀS)⁻¹ of the derivative along J of the curvature of the errors, which are lost."""
-    columns, blocks, curvature, step, S, D, bend, probe, curved, k, m, n_blocks, n = code.arguments
+def _acceleration(code: Code) -> None:
+    """−(SᵀS)⁻¹ of the derivative along J of the curvature of the errors, which are lost."""
+    columns, blocks, curvature, step, S, D, acceleration, probe, curved, k, m, n_blocks, n = code.arguments
     whole = code.apply("eq", (n_blocks, 0))
     parts = code.select(whole, code.constant(1, INT), n_blocks)
     size, square = code.op("sdiv", INT, m, parts), probe * probe
@@ -206,30 +206,30 @@ def _bent(code: Code) -> None:
         with code.over(k) as i:
             along = -_dot(code.at(columns, i * m + b * size), part, size) / square
             with code.given(whole):
-                code.store(along, bend, i)
+                code.store(along, acceleration, i)
             with code.given(~whole):
-                _add(bend, along, code.at(blocks, (b * k + i) * n), n)
+                _add(acceleration, along, code.at(blocks, (b * k + i) * n), n)
     with code.over(n) as i:
         row = code.at(S, i * (n + 2))
-        x = code.load(bend, i) / code.load(row)
-        code.store(x, bend, i)
-        _add(code.at(bend, i + 1), -x, code.at(row, 1), n - 1 - i)
-    _solve(S, bend, n)
+        x = code.load(acceleration, i) / code.load(row)
+        code.store(x, acceleration, i)
+        _add(code.at(acceleration, i + 1), -x, code.at(row, 1), n - 1 - i)
+    _solve(S, acceleration, n)
 
     def more(i: Value, squares: Sequence[Value]) -> list[Value]:
-        scaled = [code.load(D, i) * code.load(x, i) for x in (bend, step)]
+        scaled = [code.load(D, i) * code.load(x, i) for x in (acceleration, step)]
         return [fma(x, x, square) for x, square in zip(scaled, squares, strict=True)]
 
     of_bend, of_step = code.loop(n, [code.constant(0.0)] * 2, more)
     small = 2.0 * apply("sqrt", of_bend) <= curved * apply("sqrt", of_step)  # NaN is not small
     with code.given(~small), code.over(n) as i:
-        code.store(code.constant(0.0), bend, i)
+        code.store(code.constant(0.0), acceleration, i)
 
 
 _FUNCTIONS: dict[str, tuple[Callable[[Code], None], list[Type]]] = {
     "fold": (_folded, [*[POINTER] * 5, INT, INT, INT]),
     "damp": (_damped, [*[POINTER] * 5, DOUBLE, INT]),
-    "bend": (_bent, [*[POINTER] * 7, DOUBLE, DOUBLE, INT, INT, INT, INT]),
+    "acceleration": (_acceleration, [*[POINTER] * 7, DOUBLE, DOUBLE, INT, INT, INT, INT]),
 }
 
 

@@ -42,7 +42,7 @@ Key = Any
 class Form:
     """All that the code of a lattice depends on: not its size, nor the values of parameters.
 
-    The terms are T ("kinetic"), U ("site") and V by their distances, with their letters; `directions` those of v and w,
+    The terms are T ("kinetic"), U ("site") and V by their distances, with their symbols; `directions` those of v and w,
     `arrays` those of c with a value at each site. The boundary is that of each axis, of the lanes last. With friction
     −γp (`damped`) a column has two more numbers. `even` slabs are alike.
     """
@@ -141,36 +141,36 @@ def _is_costly(x: Traced) -> bool:
 
 
 class Potential:
-    """A term of one site or bond f(x), with ∇f (`slopes`), ∇²f row by row (`bends`), ∇²f w + ½ ∇³f(v, v) (`bent`)."""
+    """A term f(x) of a site or bond, with ∇f (`slopes`), ∇²f row by row (`hessian`), ∇²f w + ½ ∇³f(v, v) (`third`)."""
 
     def __init__(self, form: Form, f: Any, x: Sequence[Any]) -> None:
         n = self.n = len(x)
-        letters = (*x, *form.directions, *form.c)
+        symbols = (*x, *form.directions, *form.c)
         program = traced(
-            lambda *numbers: [evaluator(dict(zip(letters, numbers, strict=True)))(f)], *(s.name for s in letters)
+            lambda *numbers: [evaluator(dict(zip(symbols, numbers, strict=True)))(f)], *(s.name for s in symbols)
         )
         given, (y,) = program.inputs, program.outputs
         self.x, v, w = given[:n], given[n : 2 * n], given[2 * n : 3 * n]
-        slopes, bends, bent = gradient(y, self.x), list[Any](), list[Any]()
+        slopes, hessian, third = gradient(y, self.x), list[Any](), list[Any]()
         if form.level:
-            bends = [a for row in derivatives(slopes, self.x) for a in row]
+            hessian = [a for row in derivatives(slopes, self.x) for a in row]
         if form.level == CURVATURE:
             twice = tangent(tangent(slopes, self.x, v), self.x, v)
-            bent = [a + 0.5 * b for a, b in zip(tangent(slopes, self.x, w), twice, strict=True)]
-        self.slopes, self.bends, self.bent = (Program(given, values) for values in (slopes, bends, bent))
+            third = [a + 0.5 * b for a, b in zip(tangent(slopes, self.x, w), twice, strict=True)]
+        self.slopes, self.hessian, self.third = (Program(given, values) for values in (slopes, hessian, third))
 
     def kept(self, costly: bool) -> list[int]:
         """The second derivatives that are not constant, of those that are alike the first; or the costly ones alone."""
         found: dict[int, int] = {}
-        for k, f in enumerate(self.bends.outputs):
+        for k, f in enumerate(self.hessian.outputs):
             needs = reached([f])
             if {x.order for x in self.x} & {x.order for x in needs} and (not costly or any(map(_is_costly, needs))):
                 found.setdefault(f.order, k)
         return list(found.values())
 
-    def product(self, made: Arrangement, bends: Sequence[Any], v: Sequence[Any]) -> list[Any]:
-        """∇²f v; kept second derivatives are letters."""
-        rows = (bends[i * self.n : (i + 1) * self.n] for i in range(self.n))
+    def product(self, made: Arrangement, hessian: Sequence[Any], v: Sequence[Any]) -> list[Any]:
+        """∇²f v; kept second derivatives are symbols."""
+        rows = (hessian[i * self.n : (i + 1) * self.n] for i in range(self.n))
         return [sum((times(a, b) for a, b in zip(row, v, strict=True)), made.number(0.0)) for row in rows]
 
 
@@ -208,24 +208,24 @@ class Pass:
         if self.name in (KICK, OPEN):
             slopes = potential.slopes(*x, *v, *w, *c)
         elif self.name == LAST:
-            slopes = potential.bent(*x, *v, *w, *c)
+            slopes = potential.third(*x, *v, *w, *c)
         else:
-            wanted = [f if k not in self._alike(term) else 0.0 for k, f in enumerate(potential.bends.outputs)]
-            bends = Program(potential.bends.inputs, wanted)(*x, *v, *w, *c)
-            bends = [
+            wanted = [f if k not in self._alike(term) else 0.0 for k, f in enumerate(potential.hessian.outputs)]
+            hessian = Program(potential.hessian.inputs, wanted)(*x, *v, *w, *c)
+            hessian = [
                 get["kept", (term, self._alike(term)[k])] if k in self._alike(term) else made.number(f)
-                for k, f in enumerate(bends)
+                for k, f in enumerate(hessian)
             ]
-            slopes = potential.product(made, bends, v)
+            slopes = potential.product(made, hessian, v)
         found: dict[Key, Any] = {("flux", f): made.number(y) for f, y in enumerate(slopes)}
         if self.name == OPEN and self.form.level:
-            bends = Program(potential.bends.inputs, [potential.bends.outputs[k] for k in kept])(*x, *v, *w, *c)
-            found |= {("kept", (term, k)): made.number(y) for k, y in zip(kept, bends, strict=True)}
+            hessian = Program(potential.hessian.inputs, [potential.hessian.outputs[k] for k in kept])(*x, *v, *w, *c)
+            found |= {("kept", (term, k)): made.number(y) for k, y in zip(kept, hessian, strict=True)}
         return found
 
     def _alike(self, term: Any) -> dict[int, int]:
         """Each kept second derivative, and those that equal it, by the one that is kept."""
-        outputs = self._terms[term].bends.outputs
+        outputs = self._terms[term].hessian.outputs
         of = {outputs[k].order: k for k in self._kept[term]}
         return {k: of[f.order] for k, f in enumerate(outputs) if isinstance(f, Traced) and f.order in of}
 

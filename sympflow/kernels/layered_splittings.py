@@ -85,8 +85,8 @@ class LayeredCode(SplittingRollouts):
         of_q, a, b = cotangents[:d], numbers(0), numbers(1)
         of_p = self._drifted(cotangents[d:], of_q, a)  # M⁻¹ is symmetric
         v = [-(b * x) for x in of_p]
-        bend = _Layers(self._potential, values[0], kind, slopes).slopes(values[:d], v)
-        return [*(x + y for x, y in zip(of_q, bend, strict=True)), *of_p], []
+        product = _Layers(self._potential, values[0], kind, slopes).slopes(values[:d], v)
+        return [*(x + y for x, y in zip(of_q, product, strict=True)), *of_p], []
 
     def step_made(self, width: int, own: bool) -> Callable[..., None]:
         def stage(values: list[Value], numbers: Numbers, kind: Value, step: Value) -> list[Value]:

@@ -26,7 +26,7 @@ import numpy as np
 from sympflow.compiler.control import INT, POINTER, Code, Rows, Type, Value
 from sympflow.compiler.dual import Dual, DualRows
 from sympflow.compiler.functions import fma
-from sympflow.kernels.activations import bent
+from sympflow.kernels.activations import activation_program
 from sympflow.kernels.rollouts import filled
 from sympflow.kernels.runs import begun, finished
 from sympflow.kernels.threads import run_rows
@@ -186,7 +186,7 @@ class _Sweeps:
 
     def __init__(self, code: Code, sizes: _Sizes, activation: str, velocity: bool, theta: Value, work: Value) -> None:
         self.code, self.sizes, self.velocity, self.theta = code, sizes, velocity, theta
-        self.activation = bent(activation, 2)
+        self.activation = activation_program(activation, 2)
         self.K, self.k, self.w, self.b, self.W, _ = sizes.starts
         self.rows: dict[str, Any] = {}
         at = 0

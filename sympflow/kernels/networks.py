@@ -24,7 +24,7 @@ from sympflow.compiler import NotCompiled, arrays_only
 from sympflow.compiler.control import DOUBLE, INT, POINTER, Type, Value
 from sympflow.compiler.functions import fma
 from sympflow.compiler.program import traced
-from sympflow.kernels.activations import SIGMAS, bent
+from sympflow.kernels.activations import SIGMAS, activation_program
 from sympflow.kernels.protocol import Kernel, Run, Steps, Task, both_ways, run_states
 from sympflow.kernels.reverse import Chained
 from sympflow.kernels.rollouts import ONE, Columns, Rollouts, aligned
@@ -333,7 +333,7 @@ class _Impulse:
 def _slopes(layer: NetworkLayer) -> tuple[Callable[[Any], Any] | None, int]:
     """σ and σ' as a function of numbers; or None, and the address of a function of the user's that cannot be traced."""
     if layer.activation in SIGMAS:
-        return bent(layer.activation, 1), 0
+        return activation_program(layer.activation, 1), 0
     function: Any = layer.slopes
     try:
         return traced(getattr(function, "py_func", function), "a"), 0

@@ -33,7 +33,7 @@ from sympflow.kernels.one_steps import (
     spelled,
     terms_of,
 )
-from sympflow.kernels.one_steps import lettered as with_letters
+from sympflow.kernels.one_steps import lettered as with_coefficients
 from sympflow.kernels.rollouts import Rollouts
 from sympflow.kernels.runs import Numbers, Room, Values
 from sympflow.lazy import kept
@@ -70,7 +70,7 @@ def implicit_kernel(
     if names and written.time is not None:
         raise NotCompiled("`system` depends on t: use a splitting method.")
     symbols = parametric(written, names)
-    of_time = with_letters(symbols, [symbols.H])
+    of_time = with_coefficients(symbols, [symbols.H])
 
     def made(*kind: bool) -> NewtonCode:
         return shared_code(symbols, (tableau, kind), lambda: newton_code(of_time, tableau, *kind))
@@ -120,7 +120,7 @@ class NewtonCode(OneStep):
 
     @cached_property
     def slopes(self) -> Program:
-        """∇H and the upper triangle of ∇²H, row by row, from q, p, the parameters and the letters."""
+        """∇H and the upper triangle of ∇²H, row by row, from q, p, the parameters and the coefficients."""
         symbols = self.lettered.symbols
         program = recorded(self.lettered.expressions, (*symbols.q, *symbols.p, *self.lettered.given))
         y = program.inputs[: self.n_out]
@@ -130,7 +130,7 @@ class NewtonCode(OneStep):
 
     @cached_property
     def field_reversed(self) -> Program:
-        """The derivatives of J∇H·μ by the parameters, from q, p, the parameters and the letters, and from μ."""
+        """The derivatives of J∇H·μ by the parameters, from q, p, the parameters and the coefficients, and from μ."""
         symbols, n, d = self.lettered.symbols, self.n_out, self.ndof
         program = recorded(self.lettered.expressions, (*symbols.q, *symbols.p, *self.lettered.given))
         recording, slope = program.inputs[0].recording, gradient(program.outputs[0], program.inputs[:n])
@@ -272,8 +272,8 @@ class _Iteration:
                 self.S[j * n + k] = self.S[k * n + j] = x
 
     def given_at(self, i: Any) -> list[Any]:
-        """The parameters, and the letters of a stage."""
-        method, count = self.method, len(self.method.lettered.letters)
+        """The parameters, and the coefficients of a stage."""
+        method, count = self.method, len(self.method.lettered.time_coefficients)
         places = [*range(1, 1 + method.parameters), *(i * count + (method.size + k) for k in range(count))]
         return [self.column[place] for place in places]
 
@@ -315,12 +315,12 @@ class _Iteration:
             ratios.append(where(top.value > 0.0, top.value / scale.value, top.value))
         return where(ratios[1] <= ratios[0], ratios[0], ratios[1])
 
-    def fill_letters(self) -> None:
-        """The letters, which depend on t alone, of all stages into the column, behind its numbers."""
-        method, count = self.method, len(self.method.lettered.letters)
+    def fill_coefficients(self) -> None:
+        """The coefficients, which depend on t alone, of all stages into the column, behind its numbers."""
+        method, count = self.method, len(self.method.lettered.time_coefficients)
         nodes = self.array("nodes", method.nodes)
         for i in self.each(self.s) if count else ():
-            for k, x in enumerate(method.letters_at([self.column[j] for j in range(method.size)], nodes[i])):
+            for k, x in enumerate(method.coefficients_at([self.column[j] for j in range(method.size)], nodes[i])):
                 self.column[i * count + (method.size + k)] = x
 
     def advance(self, solved: Value) -> None:
@@ -402,10 +402,10 @@ class _InRegisters(NewtonCode):
 
     def _solved(self, y: list[Value], numbers: Numbers, step: Value) -> tuple[_Iteration, Value, Value]:
         """A step whose K are known, the iterations taken, and where they converged."""
-        code, letters = y[0].code, self.stages * len(self.lettered.letters)
-        column: list[Any] = [*self.column(code, numbers, step), *[0.0] * letters]
+        code, coefficients = y[0].code, self.stages * len(self.lettered.time_coefficients)
+        column: list[Any] = [*self.column(code, numbers, step), *[0.0] * coefficients]
         found = self._iteration(y, [0.0] * self.unknowns, column)
-        found.fill_letters()
+        found.fill_coefficients()
         found.K, taken, solved = self._iterated(code, y[: self.n_out], column)
         return found, taken, solved
 
@@ -437,7 +437,7 @@ class _InRegisters(NewtonCode):
     @cached_property
     def _iterations(self) -> tuple[Program, Program]:
         """The first iteration, of y and the column's numbers, and the others, of K and the sizes too."""
-        n, N, size = self.n_out, self.unknowns, self.size + self.stages * len(self.lettered.letters)
+        n, N, size = self.n_out, self.unknowns, self.size + self.stages * len(self.lettered.time_coefficients)
 
         def first(*numbers: Any) -> list[Any]:
             found = self._iteration(numbers[:n], [0.0] * N, [*numbers[n:]])
@@ -484,7 +484,7 @@ class _InMemory(NewtonCode):
         super().__init__(lettered, tableau, compensated, damped)
         self.terms = terms_of(lettered) if is_large(lettered.symbols) else None
         self.data = [] if self.terms is None else self.terms.data
-        n, N, numbers = self.n_out, self.unknowns, self.size + self.stages * len(lettered.letters)
+        n, N, numbers = self.n_out, self.unknowns, self.size + self.stages * len(lettered.time_coefficients)
         self._wide = -(-(N + 1) // ABREAST) * ABREAST  # the last ones fill up registers
         self._sizes = [N, numbers, N * self._wide, n, n, n * n, N]
         self.room = sum(self._sizes)
@@ -503,7 +503,7 @@ class _InMemory(NewtonCode):
         found = _Looped(self, self._wide, room.place, *rooms, *(room.data(i) for i in range(len(self.data))))
         for i, x in enumerate(self.column(code, numbers, step)):
             found.column[i] = x
-        found.fill_letters()
+        found.fill_coefficients()
         found.clear(found.K, self.unknowns)
         found.clear(found.S, self.n_out**2)
 

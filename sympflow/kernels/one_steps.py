@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from sympflow.compiler import NotCompiled
 from sympflow.compiler.control import Code, Value
-from sympflow.hamiltonian.formulas import MOST_COMPILED, TracedHamiltonian, TracedLetters
+from sympflow.hamiltonian.formulas import MOST_COMPILED, TracedCoefficients, TracedHamiltonian
 from sympflow.kernels.protocol import Kernel, Run, Steps, Task, run_states
 from sympflow.kernels.rollouts import Columns, Rollouts, shared
 from sympflow.kernels.runs import Numbers, step_function
@@ -36,17 +36,17 @@ __all__ = [
 
 
 Lettered = Any
-"""Expressions with letters for what depends on the time alone: of symbols, or of functions that were traced."""
+"""Expressions with coefficients for what depends on the time alone: of symbols, or of functions that were traced."""
 
 
 def lettered(form: Any, expressions: Sequence[Any]) -> Lettered:
-    """Expressions of a form with letters; a ValueError names a function in them that has no compiled form."""
+    """Expressions of a form with coefficients; a ValueError names a function in them that has no compiled form."""
     if isinstance(form, TracedHamiltonian):
         check_size(form)
-        return TracedLetters(form, expressions)
-    from sympflow.kernels.stage_times import SymbolicLetters
+        return TracedCoefficients(form, expressions)
+    from sympflow.kernels.stage_times import SymbolicCoefficients
 
-    return SymbolicLetters(form, expressions)
+    return SymbolicCoefficients(form, expressions)
 
 
 def is_large(form: Any) -> bool:
@@ -150,8 +150,8 @@ class OneStep(Rollouts):
             column[at] = column[at] + step * column[0]
         return column
 
-    def letters_at(self, column: Sequence[Any], node: Any) -> list[Any]:
-        """The letters at a time in the step, a node or the value of one."""
+    def coefficients_at(self, column: Sequence[Any], node: Any) -> list[Any]:
+        """The coefficients at a time in the step, a node or the value of one."""
         if not self.driven:
             return []
         at = 1 + self.parameters

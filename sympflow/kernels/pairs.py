@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 __all__ = ["PairCode", "PairForces", "few"]
 
-KINDS = {"gradient": (1,), "hessian_vector": (1, 2), "bend": (2, 3)}
+KINDS = {"gradient": (1,), "hessian_vector": (1, 2), "third_derivative": (2, 3)}
 """The derivatives of V by s that are in ∇V, ∇²V·v and ½ ∇³V(v, v)."""
 SHIFT = 3
 LANES = 1 << SHIFT
@@ -51,8 +51,8 @@ def slopes_of(local: PairsHamiltonian, kinds: Sequence[int]) -> Arranged:
     """The derivatives of V by s, with factors 2ᵏ: a program of s, columns of both bodies, constants."""
     states = [(local.s.name, 0), *((a.name, -40) for a in local.first), *((b.name, -20) for b in local.second)]
     made = Arrangement(states, [c.name for c in local.c])
-    letters = (local.s, *local.first, *local.second, *local.c)
-    value = evaluator(dict(zip(letters, (*made.states, *made.constants), strict=True)))
+    symbols = (local.s, *local.first, *local.second, *local.c)
+    value = evaluator(dict(zip(symbols, (*made.states, *made.constants), strict=True)))
     return made.finish([made.written(made.number(value(local.slopes[k]))) for k in kinds])
 
 
@@ -127,7 +127,7 @@ class FewSymbols:
     samples: Mapping[str, Any] = MappingProxyType({})
 
     def __init__(self, local: PairsHamiltonian) -> None:
-        named = local.letters({})
+        named = local.parameter_values({})
         self.local, self.ndof = local, local.ndof
         self.values, self.parameters = tuple(named.values()), tuple(map(sp.Symbol, named))
         self.q, self.p = (tuple(sp.Symbol(f"{x}{i + 1}") for i in range(self.ndof)) for x in "qp")
@@ -201,8 +201,8 @@ class FewShape(Shape):
         product = self._sum("hessian_vector", v, nothing)
         momenta = moved(more[0], product)
         if self.terms > 2:
-            bent = self._sum("bend", v, self._sum("hessian_vector", self._velocities(product), nothing))
-            momenta = moved(-more[1], bent)
+            third = self._sum("third_derivative", v, self._sum("hessian_vector", self._velocities(product), nothing))
+            momenta = moved(-more[1], third)
         return momenta
 
     def _velocities(self, x: Sequence[Any]) -> list[Any]:
@@ -239,9 +239,9 @@ class FewShape(Shape):
         local, made = self._local, self.made
         columns = [self.number[f"column_{c}_{body}"] for body in (i, j) for c in range(len(local.columns))]
         letter = made.letter(s)
-        letters = (local.s, *local.first, *local.second, *local.c)
+        symbols = (local.s, *local.first, *local.second, *local.c)
         values = (letter, *columns, *(self.number[c.name] for c in local.c))
-        slope = evaluator(dict(zip(letters, values, strict=True)))(local.slopes[kind])
+        slope = evaluator(dict(zip(symbols, values, strict=True)))(local.slopes[kind])
         slope = made.written(slope if factor is None else factor * slope)
         if local.cutoff is None:
             return slope
@@ -319,7 +319,7 @@ class PairSums(Forces):
                 self._stages.kicked(room, terms, column)
         self._stages.drifted(room, column)
 
-    def velocity(self, room: Room, p: Rows, out: Rows, d: Value, letters: Sequence[Any]) -> None:
+    def velocity(self, room: Room, p: Rows, out: Rows, d: Value, coefficients: Sequence[Any]) -> None:
         code, sites, count = room.code, place(room.places, "sites"), field(room.places, "size") >> SHIFT
         with code.over(count) as i:
             w = code.load(sites, i << SHIFT, _LANES)
@@ -327,7 +327,9 @@ class PairSums(Forces):
                 at = count * k + i
                 out[at] = w * p[at]
 
-    def sum(self, order: int, room: Room, given: Sequence[Rows], out: Rows, d: Value, letters: Sequence[Any]) -> None:
+    def sum(
+        self, order: int, room: Room, given: Sequence[Rows], out: Rows, d: Value, coefficients: Sequence[Any]
+    ) -> None:
         kind = tuple(KINDS)[order]
         room.code.outlined(f"sum_{kind}", (room.places, room.place, given[-1].place, out.place), self._sum(kind))
 

@@ -26,7 +26,7 @@ from sympflow.hamiltonian.parts import LINEAR, ExactParts, PartFunctions, SubFlo
 from sympflow.kernels.protocol import Kernel, Run, Steps, Task, begun_in, run_states
 from sympflow.kernels.rollouts import Columns, Rollouts, shared
 from sympflow.kernels.runs import Numbers, begun, finished
-from sympflow.kernels.stage_times import SymbolicLetters
+from sympflow.kernels.stage_times import SymbolicCoefficients
 from sympflow.kernels.terms import MOST_IN_REGISTERS, written_out
 from sympflow.kernels.threads import given
 from sympflow.lazy import kept
@@ -85,24 +85,26 @@ class PartMaps:
 
     def __init__(self, parts: ExactParts, scales: Scales, filters: bool) -> None:
         self.parts, self.scales, self.ndof, self.filters = parts, scales, parts.ndof, filters
-        self.lettered = [SymbolicLetters(part, [part.H]) for part in parts.rest]
+        self.lettered = [SymbolicCoefficients(part, [part.H]) for part in parts.rest]
         self.codes: dict[tuple[tuple[int, ...], ...], PartsCode] = {}
 
     @kept
     def arranged(self, code: int) -> Arranged:
-        """The map of a part, from x, y and letters of the time and what its table makes of a column's numbers."""
-        bends = code >= WITH_GRADIENT
-        shapes = [self._part(code % WITH_GRADIENT, bends, expand) for expand in (True, False)[: 1 + bends]]
+        """The map of a part, from x, y and coefficients of the time and what its table makes of a column's numbers."""
+        with_gradient = code >= WITH_GRADIENT
+        shapes = [
+            self._part(code % WITH_GRADIENT, with_gradient, expand) for expand in (True, False)[: 1 + with_gradient]
+        ]
         return min(shapes, key=lambda shape: shape[0])[1]
 
-    def _part(self, number: int, bends: bool, expand: bool) -> tuple[int, Arranged]:
+    def _part(self, number: int, with_gradient: bool, expand: bool) -> tuple[int, Arranged]:
         """x + b J∇H_k(x), and with a force gradient g ∇²U M⁻¹∇U added to y; its cost before it."""
-        d, letters = self.ndof, self.lettered[number - 1].letters
+        d, coefficients = self.ndof, self.lettered[number - 1].time_coefficients
         filters = [f"phi_{j}" for j in range(d) if self.filters]
         states = [*((f"x_{j}", 0) for j in range(d)), *((f"y_{j}", EARLY) for j in range(d))]
         constants = ["b", "g", *filters, *self.scales.named]
-        made = Arrangement([*states, *((s.name, EARLY) for s in letters)], constants, expand)
-        (b, g, *more), program = made.constants, self._slopes(number, bends)
+        made = Arrangement([*states, *((s.name, EARLY) for s in coefficients)], constants, expand)
+        (b, g, *more), program = made.constants, self._slopes(number, with_gradient)
         phi, scales = more[: len(filters)], more[len(filters) :]
         slopes = program(*made.states, *(phi or [made.number(1.0)] * d), *scales)
         changes = [times(b, v) for v in slopes[d : 2 * d]]
@@ -111,13 +113,13 @@ class PartMaps:
         arranged = made.finish(new)
         return 2 * max(map(made.depth, new)) + 3 * len(arranged.body), arranged
 
-    def _slopes(self, number: int, bends: bool) -> Program:
-        """∂H_k/∂x, ∂H_k/∂y and, where it is needed, ∂²H_k/∂x² M⁻¹∂H_k/∂x, from modes, letters and filters."""
+    def _slopes(self, number: int, with_gradient: bool) -> Program:
+        """∂H_k/∂x, ∂H_k/∂y and, where it is needed, ∂²H_k/∂x² M⁻¹∂H_k/∂x, from modes, coefficients and filters."""
         lettered, scales, d = self.lettered[number - 1], self.scales, self.ndof
-        part, count = self.parts.rest[number - 1], len(lettered.letters)
+        part, count = self.parts.rest[number - 1], len(lettered.time_coefficients)
 
         def slopes(*numbers: Any) -> list[Any]:
-            x, y, letters, phi = (numbers[i:j] for i, j in pairwise((0, d, 2 * d, 2 * d + count, 3 * d + count)))
+            x, y, coefficients, phi = (numbers[i:j] for i, j in pairwise((0, d, 2 * d, 2 * d + count, 3 * d + count)))
             named = dict(zip(scales.named, numbers[3 * d + count :], strict=True))
             filtered = [f * v for f, v in zip(phi, x, strict=True)]
             q, p = (
@@ -127,13 +129,17 @@ class PartMaps:
             q = [center + v for center, v in zip(scales.row("center", named), q, strict=True)]
             given = [named.get(s.name, scales.values[s.name]) for s in part.parameters]
             symbols = *part.q, *part.p, *lettered.given
-            known = evaluator(dict(zip(symbols, (*q, *p, *given, *letters), strict=True)))
+            known = evaluator(dict(zip(symbols, (*q, *p, *given, *coefficients), strict=True)))
             slope = gradient(known(lettered.expressions[0]), [*x, *y])
-            rates = scales.row("rate", named) if bends else []
-            along = tangent(slope[:d], x, [rate * v for rate, v in zip(rates, slope, strict=False)]) if bends else []
+            rates = scales.row("rate", named) if with_gradient else []
+            along = (
+                tangent(slope[:d], x, [rate * v for rate, v in zip(rates, slope, strict=False)])
+                if with_gradient
+                else []
+            )
             return [*slope, *along]
 
-        names = [f"{name}_{j}" for name in ("x", "y") for j in range(d)] + [s.name for s in lettered.letters]
+        names = [f"{name}_{j}" for name in ("x", "y") for j in range(d)] + [s.name for s in lettered.time_coefficients]
         return traced(slopes, *names, *(f"phi_{j}" for j in range(d)), *scales.named)
 
     @cached_property
@@ -176,12 +182,12 @@ class PartMaps:
         return self._linear(values, numbers) if code == LINEAR else self._moved(code, values, numbers, step)
 
     def _moved(self, k: int, values: Sequence[Any], numbers: Numbers, step: Any) -> list[Any]:
-        body, letters = self.arranged(k), []
+        body, coefficients = self.arranged(k), []
         lettered = self.lettered[k % WITH_GRADIENT - 1]
-        if lettered.letters:
+        if lettered.time_coefficients:
             before, first, length = (numbers(self.size - TIME_WIDTH + i) for i in range(TIME_WIDTH))
-            letters = lettered.at(first + (step * length + before), [])
-        return body.body(*values, *letters, *(numbers(i) for i in range(len(body.table.outputs))))
+            coefficients = lettered.at(first + (step * length + before), [])
+        return body.body(*values, *coefficients, *(numbers(i) for i in range(len(body.table.outputs))))
 
     def _linear(self, values: Sequence[Any], numbers: Numbers) -> list[Any]:
         """Rotations by three shears after exact quarter turns, hyperbolic ones by shears alone, drifts."""
@@ -383,8 +389,10 @@ class PartsLoops:
     def _singles(self, maps: PartMaps) -> PartsCode:
         """The code of one map a column."""
         numbers = range(1, len(self.parts.rest) + 1)
-        bent = [WITH_GRADIENT + k for k in numbers if self.parts.has_force_gradient]
-        return self._code(maps, [(k,) for k in (IDLE, *([LINEAR] if self.parts.linear else []), *numbers, *bent)])
+        with_gradients = [WITH_GRADIENT + k for k in numbers if self.parts.has_force_gradient]
+        return self._code(
+            maps, [(k,) for k in (IDLE, *([LINEAR] if self.parts.linear else []), *numbers, *with_gradients)]
+        )
 
     def table(self, sequence: Sequence[SubFlow], n: int, maps: PartMaps) -> tuple[np.ndarray, np.ndarray]:
         """Codes (m,) and numbers (n, m, size), those of the time, of a driven system, still 0: see `timed`."""

@@ -37,7 +37,7 @@ EARLY = -4  # when momenta are known before the positions, in cycles
 
 
 class Formulas(Protocol):
-    """V and T with their letters: a SymbolicHamiltonian, a TracedHamiltonian, or `FewSymbols` of a few bodies."""
+    """V and T with their coefficients: a SymbolicHamiltonian, a TracedHamiltonian, or `FewSymbols` of a few bodies."""
 
     ndof: int
     samples: Mapping[str, Any]
@@ -64,7 +64,7 @@ class Formulas(Protocol):
 class Splitting:
     """The kicks and drifts of one separable system, of a level, with what else they have.
 
-    `friction` are the dimensions of Γ; of a driven system `symbols` have letters for what depends on the time. In
+    `friction` are the dimensions of Γ; of a driven system `symbols` have coefficients for what depends on the time. In
     `ranges` of one position kicks are polynomials, equal but for rounding; parameters are then in V, else numbers of a
     table.
     """
@@ -90,7 +90,7 @@ class Splitting:
 
     @property
     def parameters(self) -> Sequence[Any]:
-        """Letters whose values are numbers of a table, or made of the time."""
+        """Coefficients whose values are numbers of a table, or made of the time."""
         return self.symbols.parameters
 
     @property
@@ -103,7 +103,7 @@ class Splitting:
         return self.driving is not None
 
     def values_at(self, time: Any, length: Any, fixed: Sequence[Any]) -> list[Any]:
-        """The letters at a time, of a driven system: see `Driving`."""
+        """The coefficients at a time, of a driven system: see `Driving`."""
         assert self.driving is not None
         return self.driving.values_at(time, length, fixed)
 
@@ -374,8 +374,8 @@ def _kick_changes(
         changes = [x + times(kicks[1], y) for x, y in zip(changes, product, strict=True)]
     if terms > 2:
         again = [dot(row, by_mass(product)) for row in hessian]
-        bent = [dot([dot(row, v) for row in derivatives(rows, q)], v) for rows in hessian]
-        changes = [x - times(kicks[2], y + 0.5 * z) for x, y, z in zip(changes, again, bent, strict=True)]
+        third = [dot([dot(row, v) for row in derivatives(rows, q)], v) for rows in hessian]
+        changes = [x - times(kicks[2], y + 0.5 * z) for x, y, z in zip(changes, again, third, strict=True)]
     for e, powers in zip(kicks[1:] if monomials else (), monomials, strict=True):
         monomial: Any = 1.0
         for x, n in zip(q, powers, strict=True):
@@ -403,8 +403,8 @@ class SplittingCode(SplittingRollouts):
     def size(self) -> int:
         """Numbers of a column that the code reads."""
         if self.timed:
-            letters = len(self._splitting.parameters) - self.own
-            return len(self._splitting.numbers) - letters + CLOCK
+            coefficients = len(self._splitting.parameters) - self.own
+            return len(self._splitting.numbers) - coefficients + CLOCK
         return max(len(kind.table.outputs) for kind in self._kinds)
 
     def stage(self, values: Any, numbers: Numbers, kind: Value, step: Value) -> Any:
@@ -449,7 +449,7 @@ class SplittingCode(SplittingRollouts):
         return slice(end - CLOCK, end)
 
     def _lettered(self, time: Any, given: Sequence[Any]) -> list[Any]:
-        """The numbers of a column of a driven system, of those that are given, with its letters at a time."""
+        """The numbers of a column of a driven system, of those that are given, with its coefficients at a time."""
         clock = self._clock
         fixed = given[clock.stop :]
         return [*given[: clock.start], *fixed, *self._splitting.values_at(time, given[0], fixed)]

@@ -24,40 +24,40 @@ from sympflow.hamiltonian.parameters import Samples
 from sympflow.hamiltonian.recorded import check_recorded
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 
-__all__ = ["Driving", "SymbolicLetters", "driven_form", "letters_of_time"]
+__all__ = ["Driving", "SymbolicCoefficients", "coefficients_of_time", "driven_form"]
 
 
 @dataclass(frozen=True)
 class Driving:
     """A system whose H depends on t, written with parameters that change from stage to stage.
 
-    The parameters of `form` are those that stay, then `letters`, functions of t and of these, then `means` over a
+    The parameters of `form` are constants, then `time_coefficients`, functions of t and of these, then `means` over a
     drift: a function of t and its integral over a `DURATION`. `samples` are by their names.
     """
 
     form: SymbolicHamiltonian
     time: sp.Symbol
-    letters: Mapping[sp.Symbol, sp.Expr]
+    time_coefficients: Mapping[sp.Symbol, sp.Expr]
     means: Mapping[sp.Symbol, tuple[sp.Expr, sp.Expr]]
     samples: Mapping[str, Samples]
 
     @property
     def key(self) -> tuple[Any, ...]:
         """Same for systems that share their code: names of samples have their digests."""
-        return self.time, *self.letters.items(), *self.means.items()
+        return self.time, *self.time_coefficients.items(), *self.means.items()
 
     def values_at(self, time: Any, length: Any, fixed: Sequence[Any]) -> list[Any]:
-        """The letters at a time, and their means over a length from there, in compiled code."""
+        """The coefficients at a time, and their means over a length from there, in compiled code."""
         parameters = dict(zip(self.form.parameters, fixed, strict=False))
         values = _values(self._expressions, {self.time: time, DURATION: length, **parameters}, self.samples)
-        means, first = list[Any](), len(self.letters)
+        means, first = list[Any](), len(self.time_coefficients)
         for f, integral in zip(values[first::2], values[first + 1 :: 2], strict=True):
             means.append(where(apply("eq", length, 0.0), f, integral / length))
         return [*values[:first], *means]
 
     @property
     def _expressions(self) -> list[sp.Expr]:
-        return [*self.letters.values(), *(f for pair in self.means.values() for f in pair)]
+        return [*self.time_coefficients.values(), *(f for pair in self.means.values() for f in pair)]
 
     def check(self) -> None:
         """Refuse what has no compiled form, by a ValueError."""
@@ -71,23 +71,23 @@ def driven_form(symbols: SymbolicHamiltonian) -> Driving:
     assert symbols.T is not None
     values = dict(zip(symbols.parameters, map(sp.Float, symbols.values), strict=True))
     of_V: dict[sp.Expr, sp.Symbol] = {}
-    V = letters_of_time(symbols.V, t, {*symbols.parameters}, of_V, "letter")
+    V = coefficients_of_time(symbols.V, t, {*symbols.parameters}, of_V, "letter")
     T, of_T = _kinetic(symbols, symbols.T.xreplace(values) if symbols.T.has(t) else symbols.T)
-    letters = {s: f for f, s in of_V.items()}
+    coefficients = {s: f for f, s in of_V.items()}
     means = {s: (f, drift((f,), t)[0]) for f, s in of_T.items()}
     form = symbols.like(T + V)
-    form.parameters, form.values = (*symbols.parameters, *letters, *means), symbols.values
-    return Driving(form, t, letters, means, symbols.samples)
+    form.parameters, form.values = (*symbols.parameters, *coefficients, *means), symbols.values
+    return Driving(form, t, coefficients, means, symbols.samples)
 
 
 def _kinetic(symbols: SymbolicHamiltonian, T: sp.Expr) -> tuple[sp.Expr, dict[sp.Expr, sp.Symbol]]:
-    """T with letters for functions of t, in which it is linear; these letters."""
+    """T with coefficients for functions of t, in which it is linear; these coefficients."""
     for expression in (T, sp.expand(T)):
         found: dict[sp.Expr, sp.Symbol] = {}
         moving = [term for term in sp.Add.make_args(expression) if term.free_symbols & {*symbols.p}]
-        lettered = letters_of_time(sp.Add(*moving), symbols.time, set(), found, "mean")
-        letters = {*found.values()}
-        if not any(sp.diff(lettered, s).free_symbols & letters for s in letters):
+        lettered = coefficients_of_time(sp.Add(*moving), symbols.time, set(), found, "mean")
+        coefficients = {*found.values()}
+        if not any(sp.diff(lettered, s).free_symbols & coefficients for s in coefficients):
             return lettered, found
     raise NotCompiled(
         f"`system` has the kinetic energy {symbols.T}, which is not a sum of products of functions of {symbols.time} "
@@ -95,8 +95,8 @@ def _kinetic(symbols: SymbolicHamiltonian, T: sp.Expr) -> tuple[sp.Expr, dict[sp
     )
 
 
-class SymbolicLetters:
-    """Expressions in q, p and `given`: the parameters, and letters for what depends on these and the time alone."""
+class SymbolicCoefficients:
+    """Expressions in q, p and `given`: the parameters, and coefficients that depend on these and the time."""
 
     def __init__(self, symbols: SymbolicHamiltonian, expressions: Sequence[sp.Expr]) -> None:
         _check(expressions)
@@ -104,14 +104,14 @@ class SymbolicLetters:
         time, fixed = symbols.time, {*symbols.parameters}
         self.expressions = list(expressions)
         if time is not None:
-            self.expressions = [letters_of_time(f, time, fixed, found, "letter") for f in expressions]
-        self.symbols, self.letters = symbols, {s: f for f, s in found.items()}
-        self.given = (*symbols.parameters, *self.letters)
+            self.expressions = [coefficients_of_time(f, time, fixed, found, "letter") for f in expressions]
+        self.symbols, self.time_coefficients = symbols, {s: f for f, s in found.items()}
+        self.given = (*symbols.parameters, *self.time_coefficients)
 
     def at(self, t: Any, parameters: Sequence[Any]) -> list[Any]:
-        """The letters at times t."""
+        """The coefficients at times t."""
         known = {self.symbols.time: t, **dict(zip(self.symbols.parameters, parameters, strict=True))}
-        return _values(self.letters.values(), known, self.symbols.samples)
+        return _values(self.time_coefficients.values(), known, self.symbols.samples)
 
 
 def _check(expressions: Iterable[sp.Expr]) -> None:
@@ -128,7 +128,7 @@ def _values(expressions: Iterable[sp.Expr], known: dict[Any, Any], samples: Mapp
     return recorded(without, (*known, *found.values()))(*known.values(), *values)
 
 
-def letters_of_time(
+def coefficients_of_time(
     f: sp.Expr, t: sp.Symbol, fixed: set[sp.Symbol], found: dict[sp.Expr, sp.Symbol], prefix: str
 ) -> sp.Expr:
     """The expression with symbols for its parts that depend on t and on fixed symbols alone; these in `found`."""
@@ -140,9 +140,9 @@ def letters_of_time(
         return number * found.setdefault(part, sp.Symbol(f"{prefix}_{len(found)}", real=True))
     if f.is_Add or f.is_Mul:
         alone = [a for a in f.args if a.free_symbols <= known]
-        others = [letters_of_time(a, t, fixed, found, prefix) for a in f.args if not a.free_symbols <= known]
-        return f.func(letters_of_time(f.func(*alone), t, fixed, found, prefix), *others)
-    return f.func(*[letters_of_time(a, t, fixed, found, prefix) if isinstance(a, sp.Basic) else a for a in f.args])
+        others = [coefficients_of_time(a, t, fixed, found, prefix) for a in f.args if not a.free_symbols <= known]
+        return f.func(coefficients_of_time(f.func(*alone), t, fixed, found, prefix), *others)
+    return f.func(*[coefficients_of_time(a, t, fixed, found, prefix) if isinstance(a, sp.Basic) else a for a in f.args])
 
 
 # functions of the time that are given by samples ----------------------------------------------------------------------

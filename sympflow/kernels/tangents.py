@@ -66,7 +66,7 @@ class Linearised(Shape):
         made, symbols, d, q = self.made, self.symbols, self.d, self.q
         found = self._by_kick(self.splitting.kick(self.terms, slopes=True))
         momenta = [made.written(x + y) for x, y in zip(self.p, found[:d], strict=True)]
-        bends = [made.written(made.number(x)) for x in found[d:]]
+        second = [made.written(made.number(x)) for x in found[d:]]
         kicked, after = momenta, [made.letter(x) for x in momenta]
         ends: list[Any] = []
         if self.splitting.friction is not None:
@@ -85,7 +85,7 @@ class Linearised(Shape):
             positions = [made.written(x + y) for x, y in zip(q, moves, strict=True)]
         else:
             positions = self._displaced([slants[d * i :][:d] for i in range(d)], kicked)
-        return made.finish([*positions, *momenta, *bends, *slants, *ends])
+        return made.finish([*positions, *momenta, *second, *slants, *ends])
 
     def _drift(self) -> Program:
         """∇T and ∇²T."""
@@ -109,8 +109,8 @@ def _vector_moved(
 ) -> tuple[list[Any], list[Any]]:
     """A vector (q, p) after a stage, of the derivatives that its program gives after the state."""
     n = d * (d + 1) // 2
-    bend, slant, end = derivatives[:n], derivatives[n : n + d * d], derivatives[n + d * d :]
-    rows = [[bend[max(i, j) * (max(i, j) + 1) // 2 + min(i, j)] for j in range(d)] for i in range(d)]  # symmetric
+    second, slant, end = derivatives[:n], derivatives[n : n + d * d], derivatives[n + d * d :]
+    rows = [[second[max(i, j) * (max(i, j) + 1) // 2 + min(i, j)] for j in range(d)] for i in range(d)]  # symmetric
     p = [summed(x, row, q) for x, row in zip(p, rows, strict=True)]
     q = [summed(q[i], slant[d * i : d * (i + 1)], p) for i in range(d)]
     return q, [summed(0.0, end[d * i : d * (i + 1)], p) for i in range(d)] if end else p

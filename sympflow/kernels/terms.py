@@ -168,14 +168,14 @@ def _tree(f: sp.Basic, place: dict[sp.Symbol, int]) -> _Tree:
 
 
 class Terms:
-    """A function as the terms of each kind, whose derivatives are added up by loops over these; `letters` are numbers.
+    """A function as the terms of each kind, with derivatives summed in loops over these; `parameters` are numbers.
 
     `data` has how many terms each kind has, then the coordinates and the constants of each kind.
     """
 
-    def __init__(self, f: sp.Expr, variables: Sequence[sp.Symbol], letters: Sequence[sp.Symbol] = ()) -> None:
-        self._given = f, tuple(variables), tuple(letters)
-        self._families, self._letters = families(f, variables), tuple(letters)
+    def __init__(self, f: sp.Expr, variables: Sequence[sp.Symbol], parameters: Sequence[sp.Symbol] = ()) -> None:
+        self._given = f, tuple(variables), tuple(parameters)
+        self._families, self._parameters = families(f, variables), tuple(parameters)
         self.data = [np.array([len(family.coordinates) for family in self._families], dtype=np.int64)]
         for family in self._families:
             self.data += [family.coordinates.astype(np.int64), family.constants]
@@ -195,21 +195,21 @@ class Terms:
         return self
 
     @kept
-    def derivatives(self, times: int, bends: bool = False) -> list[Program]:
-        """∇f, ∇²f v or ½ ∇³f(v, v) of a term of each kind, by the `times` along v; with `bends` their slopes behind."""
-        return [self._derived(family, times, bends) for family in self._families]
+    def derivatives(self, times: int, with_hessian: bool = False) -> list[Program]:
+        """∇f, ∇²f v or ½ ∇³f(v, v) of a term of each kind, by the `times` along v, with their slopes if asked."""
+        return [self._derived(family, times, with_hessian) for family in self._families]
 
-    def _derived(self, family: Family, times: int, bends: bool) -> Program:
+    def _derived(self, family: Family, times: int, with_hessian: bool) -> Program:
         """∇f, that often differentiated along v, and divided by the factorial; with its own derivatives."""
         n, along = len(family.x), [f"v_{j}" for j in range(len(family.x) if times else 0)]
-        given = (*family.x, *family.c, *self._letters)
+        given = (*family.x, *family.c, *self._parameters)
 
         def slopes(*numbers: Any) -> list[Any]:
             x, v, rest = numbers[:n], numbers[n : n + len(along)], numbers[n + len(along) :]
             slope = gradient(evaluator(dict(zip(given, (*x, *rest), strict=True)))(family.f), x)
             for k in range(times):
                 slope = [y / (k + 1) for y in tangent(slope, x, v)]
-            return [*slope, *(entry for s in slope for entry in gradient(s, x))] if bends else slope
+            return [*slope, *(entry for s in slope for entry in gradient(s, x))] if with_hessian else slope
 
         names = [s.name for s in given]
         names[n:n] = along
@@ -222,7 +222,7 @@ class Terms:
         data: Sequence[Value],
         derivatives: Sequence[Program],
         given: Sequence[Rows],
-        letters: Sequence[Any],
+        parameters: Sequence[Any],
         targets: Callable[[list[Value]], list[tuple[Rows, Value]]],
     ) -> None:
         """Add derivatives of the terms of each kind, at numbers of `given`, to ``targets(places)``."""
@@ -233,6 +233,6 @@ class Terms:
                 places = [code.load(coordinates, term * n + j, INT) for j in range(n)]
                 values = [x[place] for x in given for place in places]
                 values += [code.splat(code.load(constants, term * m + j), type.width) for j in range(m)]
-                for (rows, place), y in zip(targets(places), program(*values, *letters), strict=True):
+                for (rows, place), y in zip(targets(places), program(*values, *parameters), strict=True):
                     if not is_zero(y):
                         rows[place] = rows[place] + y

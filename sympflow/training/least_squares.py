@@ -26,7 +26,7 @@ from scipy.linalg.blas import dsyrk
 from torch import Tensor
 
 from sympflow.flow.flow_map import FlowMap
-from sympflow.kernels.gauss_newton import bent, damped, factored
+from sympflow.kernels.gauss_newton import damped, factored, geodesic_acceleration
 from sympflow.training.losses import Objective
 from sympflow.training.session import Deadline, OutOfTime
 
@@ -151,7 +151,7 @@ def levenberg_marquardt(
     damping: float = FIRST_DAMPING,
     stop: Stop = never,
 ) -> Minimum:
-    """Minimize ‖r(x)‖² by QR factorizations, steps bent by the geodesic acceleration of [3]_."""
+    """Minimize ‖r(x)‖² by QR factorizations, steps corrected by the geodesic acceleration of [3]_."""
 
     scale = np.zeros(len(x))
 
@@ -210,7 +210,7 @@ class _Factored(LinearModel):
         triangle, step, decrease = damped(self._R, self.D, damping)
         probed = self.residuals(self.x + PROBE * step)
         given = self.J.columns, self.J.matrices, self.r, probed, PROBE, step, triangle, self.D, CURVED
-        return self.x + step + bent(*given), decrease
+        return self.x + step + geodesic_acceleration(*given), decrease
 
 
 class Problem:

@@ -10,7 +10,7 @@ from sympflow import HamiltonianSystem, MLPFlow, SympFlow, systems, train
 from sympflow.flow.layers import Kick
 from sympflow.flow.potentials import ACTIVATIONS, MLPPotential, Potential
 from sympflow.flow.scaling import Scaling
-from sympflow.kernels.activations import SIGMAS, bent
+from sympflow.kernels.activations import SIGMAS, activation_program
 from sympflow.training.least_squares import gram
 from sympflow.training.losses import Loss, Objective
 from sympflow.training.points import Points
@@ -69,7 +69,7 @@ def test_two_losses_at_once():
 def test_three_derivatives_of_activations(name):
     a = torch.linspace(-30, 30, 121, dtype=torch.float64, requires_grad=True)
     value = ACTIVATIONS[name].value(a)
-    for each in bent(name, 3)(a.detach().numpy()):
+    for each in activation_program(name, 3)(a.detach().numpy()):
         np.testing.assert_allclose(each, value.detach(), rtol=1e-12, atol=1e-14)
         (value,) = torch.autograd.grad(value.sum(), a, create_graph=True)
 
