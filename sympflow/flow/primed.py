@@ -276,7 +276,7 @@ class PrimedFlow(PrimedKnown, SystemFlow):
         return self._of(system, replace(self.shape, timed=not system.keeps_energy))
 
     def of_any_size(self, system: HamiltonianSystem) -> Self:
-        """Return the flow of a system with the numbers of this one, of a piece of it by its coordinates."""
+        """Return the flow of a system, or of a subsystem by its coordinates, with the numbers of this one."""
         return self._of(system, self.shape).requires_grad_(False)
 
     def on_extended(self, extended: HamiltonianSystem) -> Self:

@@ -51,7 +51,7 @@ class Definition:
     shortest_piece: float = inf  # the shortest time between two jumps of H in t
     may_jump: bool = False  # at times, which `jump_times` lists
     has_third_derivative: bool = False  # `third_derivative` of all arrays; else by differences
-    loops: str = ""  # the compiled loops of a definition by one piece: see `sympflow.hamiltonian.local`
+    loops: str = ""  # the compiled loops of a definition by one site or pair: see `sympflow.hamiltonian.local`
     leaps: bool = False  # bodies may meet, over which a step may leap: then there is `leapt`
     impulses: tuple[Any, ...] = ()  # DiracDelta in t: then there are `between_impulses` and `kicks`
     form: Any = None  # what programs are recorded of: see `sympflow.hamiltonian.formulas`

@@ -93,7 +93,7 @@ class Hamiltonian:
         self._name = name
         self.definition = definition
         self.local: LocalHamiltonian | None = definition if definition.loops else None
-        """The definition by one piece, of a lattice or of pairs, with what it has of its own, such as `shape`."""
+        """The definition by one site or one pair, with attributes such as `shape`."""
         self.ndof: int = definition.ndof
         self.separable: bool = definition.separable
         self._inverse_mass = inverse_mass
@@ -532,7 +532,11 @@ class Hamiltonian:
         """
         form = self.form
         if form is None:
-            why = f"its functions could not be traced: {self.untraced}" if self.untraced else "it is given by one piece"
+            why = (
+                f"its functions could not be traced: {self.untraced}"
+                if self.untraced
+                else "it is given by one site or one pair"
+            )
             raise ValueError(f"`system` {self.name!r} has no program, because {why}.")
         times = () if form.time is None else (form.time,)
         return recorded([form.H], (*times, *form.q, *form.p))

@@ -1,6 +1,6 @@
-"""Hamiltonians of any size that are symbolic in one piece, a site and a bond or a pair; vectors stay arrays.
+"""Hamiltonians of any size that are symbolic in one site and bond, or in one pair; vectors stay arrays.
 
-A subclass states the pieces as expressions in a few symbols, and adds their values up over the system by array
+A subclass states these terms as expressions in a few symbols, and adds their values up over the system by array
 operations. Nothing that it holds, but what depends on sites, is as long as the system.
 """
 

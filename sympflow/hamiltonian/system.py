@@ -122,7 +122,7 @@ class Scene:
         options = {name: value for name, value in options.items() if name != "time" or value is not None}
         if "time" in options:
             raise TypeError(
-                "`time` is for systems that are written out, and those by one piece do not depend on it: leave it out, "
+                "`time` is for systems that are written out, and lattices and pairs do not depend on it: leave it out, "
                 "or write H out by HamiltonianSystem.from_sympy(..., time='t')."
             )
         for name in options:
@@ -730,7 +730,7 @@ class HamiltonianSystem(Hamiltonian, Answering):
 
     @classmethod
     def _of_local(cls, local: LocalHamiltonian, damping: float | ArrayLike | None, scene: Scene) -> HamiltonianSystem:
-        """A system by a definition of one piece."""
+        """A system by a definition of one site or pair."""
         self = cls.__new__(cls)
         self._make(local, local.inverse_mass, local.quadratic_kinetic, local.params, scene, damping)
         return self

@@ -123,7 +123,7 @@ class Replicas:
 
 
 def replica(common: tuple[Model, Trajectories, Setting, np.ndarray, int], number: int) -> np.ndarray:
-    """The numbers of a model that is fitted to trajectories drawn with repetition: a piece of work."""
+    """The numbers of a model that is fitted to trajectories drawn with repetition: a task for a worker."""
     model, data, setting, theta, seed = common
     drawn = np.random.default_rng([seed, number]).integers(0, len(data.runs), len(data.runs))
     setting = setting if number >= LEAST_REPLICAS else replace(setting, stop=never)

@@ -200,8 +200,7 @@ def check_runs(system: HamiltonianSystem, fit: PrimedFit) -> None:
         )
     if fit.data is not None:
         raise ValueError(
-            "`runs` begin in states of a larger piece of the system, and `data` are of the system itself: leave out "
-            "one of them."
+            "`runs` begin in states of a larger subsystem, and `data` are of the system itself: leave out one of them."
         )
 
 

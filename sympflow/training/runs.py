@@ -257,7 +257,7 @@ class Unstarted(Run):
 
 
 def descended(common: tuple[Problem, int, Deadline, bool], theta: np.ndarray) -> Minimum:
-    """The minimum that least squares find from θ: a piece of work."""
+    """The minimum that least squares find from θ: a task for a worker."""
     fit, iterations, deadline, thorough = common
     return fit.own().minimize(theta, iterations, deadline, thorough)
 

@@ -26,7 +26,7 @@ LEAST_PART = 1.0  # seconds that a part of a budget has at least: what is compil
 
 
 class OutOfTime(Exception):
-    """Raised within a piece of work whose time is up, or which Ctrl-C asked to end."""
+    """Raised within a task whose time is up, or which Ctrl-C asked to end."""
 
 
 class Interruption:
@@ -155,7 +155,7 @@ class Session:
 
 @dataclass(frozen=True)
 class Deadline:
-    """The moment by which a piece of work has to end; it is handed down to all that takes long."""
+    """The moment by which a task has to end; it is handed down to all that takes long."""
 
     session: Session
     end: float = math.inf

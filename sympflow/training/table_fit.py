@@ -11,7 +11,7 @@ alone, from each start.
 Where long runs count, those of a lattice for instance, the best few tables are fitted to these in the end. The best of
 them is the table at Δt, and the polynomials are fitted to the labels before it, if there are as many times as powers.
 
-Every piece of it has a deadline, which each evaluation checks.
+Every part of it has a deadline, which each evaluation checks.
 """
 
 from __future__ import annotations

@@ -249,7 +249,7 @@ def _described(start: PrimedFit) -> str:
 
 
 def _trial_of(common: tuple[HamiltonianSystem, Domain, Deadline], start: PrimedFit) -> Trial:
-    """A trial as a piece of work, which says nothing where the time ends within it."""
+    """A trial as a task, which is silent if its time ends."""
     system, domain, deadline = common
     try:
         return trial(start, system, domain, deadline)

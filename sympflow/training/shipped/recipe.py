@@ -254,7 +254,7 @@ def made(recipes: Iterable[Recipe], progress: bool | None = None, workers: Any =
 
 
 def _made(progress: bool | None, path: Path) -> FlowMap:
-    """The flow of a file made again, as a piece of work."""
+    """The flow of a file made again, as a task."""
     torch.set_num_threads(1)  # the arrays are small, and one thread is reproducible
     recipe = Recipe.of(path)
     flow = recipe.fitted(progress)
