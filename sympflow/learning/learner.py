@@ -149,7 +149,7 @@ def learn(
     replicas = checked_count("replicas", plain(replicas), 0, sys.maxsize, count)
     if replicas == 1:
         raise ValueError("`replicas` must be 0, or 2 or more; got 1: 20 give useful bands.")
-    constraints = _constraints(data, separable, mass, damping, period, known)
+    constraints = constraints_of(data, separable, mass, damping, period, known)
     frequencies = () if isinstance(drive, bool) else tuple(floats("drive", drive).ravel().tolist())
     if not all(0 < frequency < math.inf for frequency in frequencies):
         raise ValueError(
@@ -216,7 +216,7 @@ def _few(data: Trajectories, seed: int) -> Trajectories:
     return data.subset(sorted(drawn[: max(1, int(np.searchsorted(numbers, MOST_VALUES, side="right")))]))
 
 
-def _constraints(data: Trajectories, separable: Any, mass: Any, damping: Any, period: Any, known: Any) -> Constraints:
+def constraints_of(data: Trajectories, separable: Any, mass: Any, damping: Any, period: Any, known: Any) -> Constraints:
     if separable is not None:
         check_flag("separable", separable)
     if not isinstance(damping, bool | str) or damping not in DAMPINGS:

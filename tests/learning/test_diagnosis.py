@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 from sympflow.learning.diagnosis import Cause, best_by_increments, forced, hint
 from sympflow.learning.families import FAMILIES
 from sympflow.learning.fitting import Setting
-from sympflow.learning.learner import _constraints
+from sympflow.learning.learner import constraints_of
 from sympflow.learning.library import library_for
 from sympflow.learning.models import drags, friction, frictions
 from sympflow.learning.parts import Drive, Polynomial
@@ -72,7 +72,7 @@ CASES = {
 
 
 def candidates(data):
-    about = _constraints(data, None, None, False, None, None)
+    about = constraints_of(data, None, None, False, None, None)
     return [c.model for family in FAMILIES.values() if family.linear for c in family.models(about)]
 
 
@@ -109,7 +109,7 @@ def test_hints_name_the_reason_and_its_size(field, d, known, said):
 
 def test_columns_in_the_wrong_order_are_told_before_any_other_model():
     data = Trajectories.read(in_pairs(runs(henon_heiles, 2, n=5, width=0.3, span=4.0, points=21)))
-    search = Search(data, data.folds(), _constraints(data, None, None, False, None, None), Setting(), 0)
+    search = Search(data, data.folds(), constraints_of(data, None, None, False, None, None), Setting(), 0)
     search.run([*FAMILIES], Session())
     assert len(search.history) == 1
     assert search.reading is not None
@@ -138,7 +138,7 @@ def test_friction_of_one_percent_is_named():
     data = Trajectories.read(
         runs(lambda t, y: [y[1], -np.sin(y[0]) - 0.01 * y[1]], 1, span=24.0, points=41, noise=0.02)
     )
-    search = Search(data, [data.split(0.2, 0)], _constraints(data, None, None, False, 2 * np.pi, None), Setting(), 0)
+    search = Search(data, [data.split(0.2, 0)], constraints_of(data, None, None, False, 2 * np.pi, None), Setting(), 0)
     search.run(["waves"], Session())
     with pytest.warns(UserWarning, match=r"There is friction, γ = 0\.01\d*: .* Pass damping=True"):
         search.diagnose(Session())

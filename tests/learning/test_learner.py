@@ -12,7 +12,7 @@ import sympflow
 from sympflow.learning.families import FAMILIES
 from sympflow.learning.fitting import Setting, fitted, judged, left_out, restored
 from sympflow.learning.inertia import Inertia
-from sympflow.learning.learner import _constraints
+from sympflow.learning.learner import constraints_of
 from sympflow.learning.library import Library, Terms
 from sympflow.learning.models import Model, drags, friction
 from sympflow.learning.orbits import Gauss, Method, first_states
@@ -197,7 +197,7 @@ def test_central_fields_are_found(force, V, observed):
     rows = [0, 1] if observed == "q" else [0, 1, 2, 3]
     runs = [(t, y[rows] + 1e-3 * rng.normal(size=(len(rows), len(t)))) for y in orbits]
     data = Trajectories.read(runs, observed=observed)
-    constraints = _constraints(data, None, None, False, None, None)
+    constraints = constraints_of(data, None, None, False, None, None)
     candidates = [*FAMILIES["central"].models(constraints)][: 1 if observed == "qp" and force is KEPLER[0] else None]
     found = [fitted(candidate.model, data, Setting()) for candidate in candidates]
     best = min(found, key=lambda one: one.loss(np.full(4, 1e-3)))
@@ -345,7 +345,7 @@ def test_a_killed_run_goes_on_from_its_checkpoint(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         sympflow.learn(runs, dt=0.5, family="polynomial", checkpoint=path, callback=interrupt)
     data = Trajectories.read(runs)
-    search = Search(data, data.folds(0.2, 0), _constraints(data, None, None, False, None, None), Setting(), 0)
+    search = Search(data, data.folds(0.2, 0), constraints_of(data, None, None, False, None, None), Setting(), 0)
     with pytest.raises(ValueError, match="`resume` is a run with another"):
         sympflow.learn(trajectories(6, 12, noise=0.02), dt=0.5, family="polynomial", resume=path)
     state = checkpoints.read(path)
@@ -387,7 +387,7 @@ def forced(request):
 
 def test_drives_and_drag_are_named_with_the_remedy(forced):
     _, data, remedy, _ = forced
-    search = Search(data, [data.split(0.2, 0)], _constraints(data, None, None, False, None, None), Setting(), 0)
+    search = Search(data, [data.split(0.2, 0)], constraints_of(data, None, None, False, None, None), Setting(), 0)
     search.run(["polynomial"], Session())
     with pytest.warns(UserWarning, match=f"pass {remedy}|Pass {remedy}"):
         search.diagnose(Session())
@@ -485,7 +485,7 @@ def test_outliers_count_less_by_hubers_loss():
 def test_data_of_no_hamiltonian_are_called_so():
     """A damped oscillator, without a word of friction: the areas shrink at its rate."""
     data = Trajectories.read(trajectories(8, 15, rate=RATE))
-    search = Search(data, [data.split(0.2, 0)], _constraints(data, None, None, False, None, None), Setting(), 0)
+    search = Search(data, [data.split(0.2, 0)], constraints_of(data, None, None, False, None, None), Setting(), 0)
     search.run(["polynomial"], Session())
     with pytest.warns(UserWarning, match=r"No symplectic map explains.*rate of -0\.2") as record:
         search.diagnose(Session())
@@ -542,7 +542,7 @@ def test_residuals_beyond_the_noise_of_the_data_are_not_explained():
 def test_noise_alone_and_a_noise_that_is_too_small_are_called_so():
     random, t = np.random.default_rng(0), np.linspace(0, 4, 21)
     data = Trajectories.read((t, random.normal(size=(6, 2, 21))))
-    search = Search(data, [data.split(0.2, 0)], _constraints(data, None, None, False, None, None), Setting(), 0)
+    search = Search(data, [data.split(0.2, 0)], constraints_of(data, None, None, False, None, None), Setting(), 0)
     search.run(["polynomial"], Session())
     with pytest.warns(UserWarning, match="explains almost nothing"):
         search.diagnose(Session())

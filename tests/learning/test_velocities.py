@@ -9,7 +9,7 @@ import sympflow
 from sympflow.learning.families import FAMILIES, Constraints
 from sympflow.learning.fitting import Setting, fitted
 from sympflow.learning.lagrangian import lagrangian_start
-from sympflow.learning.learner import _constraints
+from sympflow.learning.learner import constraints_of
 from sympflow.learning.models import friction
 from sympflow.learning.parts import Fixed, Polynomial, kinetic
 from sympflow.learning.trajectories import Trajectories
@@ -41,7 +41,7 @@ def accelerations(model, theta, y):
 
 
 def candidate(name, data, place, period=None):
-    return [*FAMILIES[name].models(_constraints(data, None, None, False, period, None))][place].model
+    return [*FAMILIES[name].models(constraints_of(data, None, None, False, period, None))][place].model
 
 
 @pytest.mark.parametrize("observed", ["qp", "qv", "q"])
@@ -62,7 +62,7 @@ def test_lagranges_equations_give_the_masses_of_a_double_pendulum(observed):
                                                          (None, 1e-3, []), (np.inf, 1.0, [])])  # fmt: skip
 def test_angles_that_nobody_told_of_are_tried(period, spread, names):
     data = Trajectories.read([(t, spread * np.stack([np.cos(t + k), -np.sin(t + k)])) for k in range(3)])
-    first, *assumed = _constraints(data, None, None, False, period, None).groups("waves")
+    first, *assumed = constraints_of(data, None, None, False, period, None).groups("waves")
     assert not first.models
     assert [group.models[0].name.split()[-1] for group in assumed] == names
     assert all(group.assumed for group in assumed)
