@@ -10,7 +10,9 @@ import builtins
 import math
 import operator
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import partial, reduce
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -22,9 +24,10 @@ from sympflow.compiler.functions import COMPOSED, OF_SCIPY, apply
 from sympflow.compiler.program import Program, Recording, Traced, reached, traced
 from sympflow.compiler.splines import NotRecorded, recorded_splines
 
-__all__ = ["WEIGHTS", "Chain", "TracedArray", "Untraceable", "trace", "trace_chain"]
+__all__ = ["WEIGHTS", "Chain", "TracedArray", "Untraceable", "trace", "trace_chain", "trace_followed"]
 
 MOST_OPERATIONS, MOST_VARIABLES = 50_000, 300  # of one function; larger systems run as array operations
+MOST_FOLLOWED = 48  # numbers that torch follows in one function; code takes some hundredths of a second for each
 LARGEST_COFACTORS = 3  # of matrices; larger ones are eliminated
 
 
@@ -178,7 +181,8 @@ _OF_NUMPY = {"dim": "axis", "keepdim": "keepdims", "input": "x", "other": "y"}
 
 def _by_rule(rule: Callable[..., Any], args: tuple[Any, ...], options: dict[str, Any]) -> Any:
     """The result of a function of torch."""
-    if rule is TORCH["linear"] and is_tensor(args[1]) and (layer := _linear_layer(*args, **options)) is not None:
+    written_out = rule is not TORCH["linear"] or _followed.get() is not None
+    if not written_out and is_tensor(args[1]) and (layer := _linear_layer(*args, **options)) is not None:
         return _array(layer, TracedTensor)
     given = {_OF_NUMPY.get(key, key): _plain(x) for key, x in options.items() if key != "dtype"}
     return _wrapped(rule(*_plain(args), **given), TracedTensor)
@@ -218,9 +222,11 @@ def _plain(x: Any) -> Any:
     if type(x) is dict:
         return {key: _plain(y) for key, y in x.items()}
     if is_tensor(x):
-        if x.requires_grad:
+        if not x.requires_grad:
+            return x.cpu().numpy()
+        if (followed := _followed.get()) is None:
             raise Untraceable(WEIGHTS)
-        return x.cpu().numpy()
+        return followed.numbers(x)
     return x
 
 
@@ -769,6 +775,69 @@ def _check_inputs(program: Program, inputs: Sequence[Traced]) -> None:
     known = {x.order for x in inputs}
     if any(x.name == "input" and x.order not in known for x in reached(program.outputs)):
         raise Untraceable(NO_CHAIN)
+
+
+class _Followed:
+    """The tensors that require gradients in a function, whose numbers are inputs of its program."""
+
+    def __init__(self, recording: Recording) -> None:
+        self._recording, self.tensors, self.inputs = recording, list[Any](), list[Traced]()
+        self._arrays: dict[int, np.ndarray] = {}
+
+    def numbers(self, x: Any) -> np.ndarray:
+        """The numbers of a tensor, the same each time."""
+        if id(x) not in self._arrays:
+            n, count = len(self.inputs), x.numel()
+            if not x.is_leaf or x.device.type != "cpu" or n + count > MOST_FOLLOWED:
+                raise Untraceable(WEIGHTS)
+            made = [self._recording.input(f"number{i}") for i in range(n, n + count)]
+            array: np.ndarray = np.empty(count, dtype=object)
+            array[:] = made
+            self.tensors.append(x)
+            self.inputs += made
+            self._arrays[id(x)] = array.reshape(tuple(x.shape))
+        return self._arrays[id(x)]
+
+
+_followed: ContextVar[_Followed | None] = ContextVar("followed", default=None)
+
+
+def _requires_gradients(x: Any) -> bool:
+    return builtins.any(map(_requires_gradients, x)) if type(x) in (list, tuple) else is_tensor(x) and x.requires_grad
+
+
+@contextmanager
+def _following(recording: Recording) -> Iterator[_Followed]:
+    """Record what is done with tensors that require gradients, by functions of torch of these alone too."""
+    from torch.overrides import TorchFunctionMode
+
+    class Mode(TorchFunctionMode):
+        def __torch_function__(self, function: Any, types: Any, args: Any = (), options: Any = None) -> Any:
+            name, options = getattr(function, "__name__", str(function)), options or {}
+            if not _requires_gradients((*args, *options.values())):
+                return function(*args, **options)
+            rule = operator.getitem if name == "__getitem__" else _torch_rule(name)
+            if rule is not None:
+                return _by_rule(rule, args, options)
+            found = function(*args, **options) if name in ("__get__", "size", "__len__", "__hash__") else args[0]
+            if is_tensor(found) and not (name == "__get__" and found.is_leaf and found.requires_grad):
+                raise Untraceable(WEIGHTS)
+            return found
+
+    token = _followed.set(followed := _Followed(recording))
+    try:
+        with Mode():
+            yield followed
+    finally:
+        _followed.reset(token)
+
+
+def trace_followed(function: Callable[..., Any], names: Sequence[Sequence[str] | str]) -> tuple[Program, list[Any]]:
+    """Record a function of tensors, and of the numbers of tensors in it that require gradients: with these tensors."""
+    recording = _Recorded()
+    with _following(recording) as followed:
+        inputs, value = _recorded(recording, function, names, True)
+    return Program([*inputs, *followed.inputs], [value]), followed.tensors
 
 
 def trace(function: Callable[..., Any], names: Sequence[Sequence[str] | str], torch: bool = False) -> Program:

@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from functools import cached_property, partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -33,12 +33,13 @@ from sympflow.arrays import (
     values,
 )
 from sympflow.compiler.program import Program, traced
-from sympflow.compiler.tracing import WEIGHTS, Untraceable, trace, trace_chain
+from sympflow.compiler.tracing import WEIGHTS, Untraceable, trace, trace_chain, trace_followed
 from sympflow.hamiltonian.definition import Definition
 from sympflow.hamiltonian.formulas import (
     MOST_COMPILED,
     TracedHamiltonian,
     TracedPoles,
+    Variable,
     kinetic_matrix,
     without_overflow,
 )
@@ -50,6 +51,18 @@ from sympflow.hamiltonian.times import probe_times
 MOST_BY_ARRAYS = 2000  # operations of a gradient, beyond which torch differentiates its own functions of arrays
 TRIED = 6  # states at which a traced function is compared with itself
 CLOSE = 1e-9  # of the largest value
+
+
+class FollowedForm(NamedTuple):
+    """A form with the numbers of tensors that torch follows as parameters, and these tensors."""
+
+    form: TracedHamiltonian
+    tensors: Sequence[Any]
+
+    def values(self, n: int) -> np.ndarray:
+        """The numbers as they are now, the same for n trajectories: (k, n)."""
+        numbers = [np.ravel(to_numpy(x)) for x in self.tensors]
+        return np.repeat(np.concatenate([*numbers, np.empty(0)])[:, None], n, axis=1)
 
 
 class CallableHamiltonian(Definition):
@@ -173,6 +186,28 @@ class CallableHamiltonian(Definition):
         if self.form is None:
             self._known = states[0], 0.0, np.nan
         return found
+
+    @cached_property
+    def followed(self) -> FollowedForm | None:
+        *_, gradient, product = self._functions
+        if self.form is not None or self.library != "torch" or self.timed or not (gradient is product is None):
+            return None
+        y0, domain, inverse_mass, _ = self._scene
+        d = self.ndof
+        try:
+            names = [[f"{letter}{i + 1}" for i in range(d)] for letter in "qp"[: 2 - self.separable]]
+            program, tensors = trace_followed(self._given_function, names)
+            program = without_overflow(program)
+        except Untraceable:
+            return None
+        letters = [Variable(f"number{i}") for i in range(sum(x.numel() for x in tensors))]
+        given = inverse_mass, False, self._kinetic, letters, [1.0] * len(letters)
+        found = FollowedForm(TracedHamiltonian(d, program, self.separable, *given), tensors)
+        states = probe_states(y0, domain, 2 * d)[:TRIED]
+        x = states[:, :d] if self.separable else states
+        with np.errstate(all="ignore"):
+            values = program(*x.T, *found.values(len(x)))[0]
+        return found if _alike(values, self._values(states, [0.0] * len(states))) else None
 
     @cached_property
     def poles(self) -> TracedPoles | None:
@@ -327,7 +362,7 @@ class CallableHamiltonian(Definition):
                 return False
         return _alike(found, self.form.gradient(state, *times))
 
-    _generated = ("form", "_jumping", "poles", "takes_tensors", "_follows_tensors")
+    _generated = ("form", "followed", "_jumping", "poles", "takes_tensors", "_follows_tensors")
 
     def learns(self, y: Array) -> bool:
         if self.numba_functions is not None or (self.form is not None and self.library == "numpy"):

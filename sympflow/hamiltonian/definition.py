@@ -58,6 +58,7 @@ class Definition:
     text: str | None = None  # H, where that is a text, or an expression in symbols
     samples: Mapping[str, Any] = MappingProxyType({})  # functions of t by samples, of symbols
     layered: Any = None  # V with layers whose weights torch follows: see `sympflow.hamiltonian.layered`
+    followed: Any = None  # the form with numbers that torch follows as parameters, of functions that hold some
     untraced: str = ""  # the reason for which they could not, a clause, known after `form`
     given_functions: bool = False  # of Python, which are traced where that is possible
     instead: str = "an implicit method such as 'gauss_legendre6', or a Runge–Kutta method"

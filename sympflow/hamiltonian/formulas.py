@@ -141,7 +141,7 @@ class TracedHamiltonian:
         self.T: Any = None
         self.inverse_mass: Entries | None = None
         if not separable:
-            self.H = Formula(program, (*times, *self.q, *self.p))
+            self.H = Formula(program, (*times, *self.q, *self.p, *self.parameters))
             return
         variables = (*self.p, *self.parameters)
         if kinetic is None:
@@ -154,11 +154,16 @@ class TracedHamiltonian:
                 return [_kinetic([[known(x) for x in row] for row in rows], numbers[:ndof])]
 
             kinetic = traced(energy, *(s.name for s in variables))
-        self.T = Formula(kinetic, variables)
+        self.T = Formula(kinetic, variables[: len(kinetic.inputs)])
         self._set_potential(Formula(program, (*times, *self.q, *self.parameters)[: len(program.inputs)]))
 
     def named(self, names: Sequence[str]) -> TracedHamiltonian:
-        """The same with entries of M⁻¹ as parameters of these names: those of the diagonal, or all, row by row."""
+        """The same with entries of M⁻¹ as parameters of these names: those of the diagonal, or all, row by row.
+
+        A form that has parameters of these names is itself returned.
+        """
+        if tuple(names) == tuple(s.name for s in self.parameters):
+            return self
         d, letters = self.ndof, [*map(Variable, names)]
         rows: list[list[Any]] = [letters[i * d : (i + 1) * d] for i in range(d)]
         if len(names) == d:

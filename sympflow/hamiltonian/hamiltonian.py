@@ -513,6 +513,13 @@ class Hamiltonian:
         """V as a chain of linear layers whose weights torch follows, of functions that are one; else None."""
         return None if self.followed_mass is not None else self.definition.layered
 
+    @property
+    def numbered(self) -> SymbolicHamiltonian | TracedHamiltonian | None:
+        """The form of which `named` makes one with numbers that torch follows as parameters; else None."""
+        if self.followed_mass is not None:
+            return self.definition.form
+        return None if self.definition.followed is None else self.definition.followed.form
+
     def learns(self, y: Array) -> bool:
         """Return True if torch follows numbers of H at the states y (..., 2d), such as weights or masses."""
         return self.followed_mass is not None or self.definition.learns(y)

@@ -30,6 +30,8 @@ def stepper_of(
             return with_loops(integrator, by_mass, arrays, _loops_by_values(make, by_mass, problem.system.definition))
         except NotCompiled:
             pass
+    if problem.backend != "array" and (followed := _followed_numbers(make, problem)) is not None:
+        return with_loops(integrator, problem, arrays, followed)
     told: list[str] = []
     kernel = compiled_loops(make, problem.y0, problem.backend, compensated, told, problem.system)
     if problem.parameter_values is not None:
@@ -108,6 +110,26 @@ def _loops_by_values(make: Callable[[tuple[str, ...]], Any], problem: Problem, H
     loops = make(tuple(problem.followed))
     loops.check_reverse()
     return loops.varied(problem.parameter_values)
+
+
+def _followed_numbers(make: Callable[[tuple[str, ...]], Any], problem: Problem) -> Any:
+    """The compiled loops of functions with tensors that torch follows, whose numbers are arguments; None without."""
+    system, y0 = problem.system, problem.y0
+    if system.form is not None or system.followed_mass is not None or system.layered is not None:
+        return None
+    found = system.definition.followed
+    able = not is_tensor(y0) or (y0.device.type == "cpu" and not transformed(y0, *found.tensors)) if found else False
+    if not able or str(y0.dtype) not in ("float64", "torch.float64", "torch.float32"):
+        return None
+    try:
+        loops = make(tuple(s.name for s in found.form.parameters))
+        if differentiable(y0, *found.tensors) and is_tensor(y0):
+            loops.check_reverse()
+    except NotCompiled:
+        return None
+    loops = loops.varied(found.values(math.prod(y0.shape[:-1])))
+    loops.tensors = found.tensors
+    return loops
 
 
 def _by_mass(problem: Problem) -> Problem:

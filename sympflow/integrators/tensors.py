@@ -108,7 +108,7 @@ class _Rolled:
         found = [torch.from_numpy(of_states.reshape(shape))]
         if self.stepper.kernel.tensors:
             ends = np.cumsum([w.numel() for w in followed])
-            pieces = [(x, w.shape) for x, w in zip(np.split(of_values[:, 0], ends), followed, strict=False)]
+            pieces = [(x, w.shape) for x, w in zip(np.split(of_values.sum(1), ends), followed, strict=False)]
         else:
             pieces = [(x, shape[:-1]) for x in of_values]
         for (x, of), w in zip(pieces, followed, strict=False):

@@ -59,8 +59,8 @@ def is_large(form: Any) -> bool:
 
 
 def spelled(system: Any, names: tuple[str, ...]) -> Any:
-    """The form of a system; that without the mass, whose entries are numbers, where torch follows it; or None."""
-    return system.spelled if system.followed_mass is None or not names else system.definition.form
+    """The form of a system; that with numbers that torch follows, where it has `names` for these; or None."""
+    return system.spelled if not names or system.spelled is not None else system.numbered
 
 
 def parametric(form: Any, names: tuple[str, ...]) -> Any:

@@ -37,12 +37,12 @@ def splitting_loops(system: HamiltonianSystem, names: tuple[str, ...] = ()) -> S
 
 
 def _traced_form(system: HamiltonianSystem, names: tuple[str, ...]) -> Any:
-    """The program of functions, with parameters of these names, or entries of M⁻¹ where torch follows the mass."""
+    """The program of functions, with parameters of these names, or numbers that torch follows as such."""
     if not names:
         return system.form
-    if system.followed_mass is not None and system.friction:
-        raise arrays_only(f"`system` {system.name!r} has friction, and a mass that torch follows")
-    return system.definition.form.named(names)
+    if system.form is None and system.friction:
+        raise arrays_only(f"`system` {system.name!r} has friction, and numbers that torch follows")
+    return (system.numbered or system.form).named(names)
 
 
 LANES_OF_SUMS, LANES = 16.0, 2.0

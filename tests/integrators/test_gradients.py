@@ -224,8 +224,8 @@ def test_weights_of_a_network_in_H(kind, method, run, batch):
 
 
 def test_networks_that_are_no_chain_run_as_arrays():
-    net, V = network("two layers")
-    system = HamiltonianSystem(lambda q: V(q) + V(q + 0.1), ndof=2)
+    net = torch.nn.Sequential(torch.nn.Linear(2, 60), torch.nn.Tanh(), torch.nn.Linear(60, 1)).double()
+    system = HamiltonianSystem(lambda q: (net(q) + net(q + 0.1))[..., 0], ndof=2)
     sol = solve(system, "verlet", (0, 1), torch.tensor(start(system, ())), dt=0.1)
     assert sol.stats["backend"] == "torch"
     assert "its linear layers do not follow one another" in repr(system)
@@ -296,6 +296,48 @@ def test_gradients_where_forces_are_rounding(method):
     J = torch.autograd.functional.jacobian(lambda y: step.step(circle, 0.0, y, 0.05), torch.tensor(circle.y0))
     omega = torch.tensor(np.kron([[0.0, 1.0], [-1.0, 0.0]], np.eye(2)))
     torch.testing.assert_close(J.T @ omega @ J, omega, rtol=0, atol=1e-13)
+
+
+NUMBERS = [torch.tensor(x, dtype=torch.float64, requires_grad=True) for x in ([1.1, 0.7], 0.9)]
+
+
+def of_numbers(q):
+    k, g = NUMBERS
+    return torch.exp(-g) * (k**2 * q**2).sum(-1) + g * k[0] * q[..., 0] ** 2 * q[..., 1]
+
+
+OF_NUMBERS = HamiltonianSystem(of_numbers, ndof=2)
+BENT = HamiltonianSystem(
+    hamiltonian=lambda q, p: (1 + NUMBERS[0][1] * q[..., 0] ** 2) * (p**2).sum(-1) / 2 + of_numbers(q), ndof=2
+)
+
+
+@pytest.mark.parametrize("batch", [(), (2, 3)], ids=["one", "batch"])
+@pytest.mark.parametrize(
+    ("system", "method"),
+    [(OF_NUMBERS, "srkn11b"), (OF_NUMBERS, "chin4a"), (OF_NUMBERS, "gauss_legendre4"), (BENT, "rk4")],
+)
+def test_gradients_flow_to_tensors_that_a_function_holds(system, method, batch):
+    found, y0 = [], start(system, batch)
+    for backend in ("compiled", "array"):
+        y = torch.tensor(y0, requires_grad=True)
+        sol = solve(system, method, (0, 1), y, dt=0.1, backend=backend)
+        assert sol.stats["backend"] == {"compiled": "compiled", "array": "torch"}[backend]
+        found.append([sol.y.detach(), *torch.autograd.grad(weighted(sol), [y, *NUMBERS])])
+    for compiled, expected in zip(*found, strict=True):
+        torch.testing.assert_close(compiled, expected, rtol=0, atol=1e-12 * float(expected.abs().max()))
+    with torch.no_grad():  # as an optimiser does
+        NUMBERS[0].mul_(1.01)
+    runs = [solve(system, method, (0, 1), y0, dt=0.1, backend=backend).y for backend in ("compiled", "array")]
+    np.testing.assert_allclose(*runs, rtol=0, atol=1e-13)
+
+
+def test_second_derivatives_by_tensors_that_a_function_holds():
+    def ends(k):
+        system = HamiltonianSystem(lambda q: (k * q**2).sum(-1) / 2 + (q**4).sum(-1), ndof=2)
+        return solve(system, "rk4", (0, 0.5), torch.tensor([0.1, 0.2, 0.3, 0.4], dtype=torch.float64), dt=0.1).y[:, -1]
+
+    assert torch.autograd.gradgradcheck(ends, torch.tensor([1.0, 2.0], dtype=torch.float64, requires_grad=True))
 
 
 def of_two(q):
