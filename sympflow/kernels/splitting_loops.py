@@ -38,11 +38,10 @@ def splitting_loops(system: HamiltonianSystem, names: tuple[str, ...] = ()) -> S
 
 def _traced_form(system: HamiltonianSystem, names: tuple[str, ...]) -> Any:
     """The program of functions, with parameters of these names, or numbers that torch follows as such."""
-    if not names:
-        return system.form
-    if system.form is None and system.friction:
+    form = system.form if system.numbered is None or not names else system.numbered
+    if form is not system.form and system.friction:
         raise arrays_only(f"`system` {system.name!r} has friction, and numbers that torch follows")
-    return (system.numbered or system.form).named(names)
+    return form.named(names) if names and form is not None else form
 
 
 LANES_OF_SUMS, LANES = 16.0, 2.0
