@@ -173,11 +173,7 @@ REMOVABLE = [
     *("log(1 + q)/q", "(exp(q) - 1 - q)/q**2", "k*(exp(k*q) - 1 - k*q)/q**2", "(q - sin(q))/q**3", "besselj(1, q)/q"),
     *("1/q - csch(q)", "csch(q)**2 - 1/q**2", "k*csch(k*q) - 1/q", "exp(-q**2)*sinh(q)/q", "sqrt(tanh(q)/q)"),
     *("(sqrt(1 + q) - 1)/q", "sin(pi*(q + 1))/q", "(q**2 - q)/(q - q**3)", "1/q - 1/(q + q**2)", "1/q - 1/sin(q)"),
-    *(
-        "1/sin(q) - 1/tan(q)",
-        "log(q) - log(sin(q))",
-        "log(exp(q) - 1) - log(q)",
-    ),
+    *("1/sin(q) - 1/tan(q)", "log(q) - log(sin(q))", "log(exp(q) - 1) - log(q)"),
 ]
 """V that is 0/0 or ∞ − ∞ at 0, in parts, and smooth there."""
 

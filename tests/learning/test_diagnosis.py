@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from sympflow.learning.diagnosis import Cause, best_by_increments, forced, hint
+from sympflow.learning.diagnosis import ALIKE, Cause, best_by_increments, forced, hint
 from sympflow.learning.families import FAMILIES
 from sympflow.learning.fitting import Setting
 from sympflow.learning.learner import constraints_of
@@ -143,3 +143,12 @@ def test_friction_of_one_percent_is_named():
     with pytest.warns(UserWarning, match=r"There is friction, γ = 0\.01\d*: .* Pass damping=True"):
         search.diagnose(Session())
     assert search.tested[0].rate == pytest.approx(-0.01, rel=0.2)
+
+
+def test_the_plainest_model_stands_for_those_that_are_as_good():
+    data = Trajectories.read(runs(dragged, 1, span=8.0, points=81))
+    models = candidates(data)
+    best, _, squares = best_by_increments(*data.split(), models)
+    alike = [k for k in squares if squares[k] <= ALIKE * min(squares.values())]
+    assert len(alike) > 1
+    assert models[best].n == min(models[k].n for k in alike)

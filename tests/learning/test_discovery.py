@@ -1,5 +1,7 @@
 """`discover`: the true terms and no other, with errors that are those of the coefficients; and honest refusals."""
 
+import pickle
+
 import numpy as np
 import pytest
 import sympy as sp
@@ -185,3 +187,36 @@ def test_outliers_are_left_to_hubers_loss():
     assert set(record.terms) == {sp.cos(q), p**2}
     np.testing.assert_allclose(sorted(record.coefficients), [-1.0, 0.5], rtol=0.01)
     assert record.noise == pytest.approx([0.012, 0.01], rel=0.25)
+
+
+def test_the_path_shows_what_the_terms_are_worth(found):
+    path = found.discovery.path
+    counts = [len(model.terms) for model in path]
+    chosen = path[counts.index(2)]
+    assert counts == sorted(set(counts))
+    assert {1, 2} < set(counts)
+    assert path[0].residual > 10 * chosen.residual
+    assert chosen.criterion == min(model.criterion for model in path)
+    noisy, exact = (Trajectories.read(measured(pendulum(), sigma)).split()[1].runs for sigma in (0.01, 0.0))
+    drawn = noisy[0].y - exact[0].y  # of the one trajectory that is held out
+    left = np.sqrt((drawn**2).sum() / (drawn.size - 4)) / 0.01  # less its initial states and two coefficients
+    assert chosen.held_out == pytest.approx(left, abs=0.05)
+    assert "<- chosen" in found.discovery.table()
+    assert found.discovery.figure().axes[0].get_yscale() == "log"
+
+
+def test_the_system_is_ordinary(found):
+    sol = sympflow.solve(found, "verlet", (0, 1), [1.0, 0.0], dt=0.05)
+    assert sol.success
+    assert found.separable
+    assert found.domain.contains(found.y0[None]).all()
+    again = pickle.loads(pickle.dumps(found))
+    assert again.discovery.terms == found.discovery.terms
+
+
+def test_noise_and_slopes_are_seen_without_a_model():
+    _, y = measured(pendulum(), 0.02, n=20)
+    curves = Trajectories.read((t, y)).smooth
+    np.testing.assert_allclose(curves.sigma, 0.02, rtol=0.25)
+    field = pendulum().vector_field(curves.points)
+    assert np.std(curves.slopes - field) < 0.1 * np.std(field)

@@ -9,7 +9,7 @@ from conftest import refusals
 from scipy.integrate import solve_ivp
 
 import sympflow
-from sympflow.learning.families import FAMILIES
+from sympflow.learning.families import FAMILIES, Candidate, pruned
 from sympflow.learning.fitting import Setting, fitted, judged, left_out, restored
 from sympflow.learning.inertia import Inertia
 from sympflow.learning.learner import constraints_of
@@ -616,3 +616,22 @@ def test_friction_that_chance_makes_negative_is_none(damping, seed):
     found = sympflow.learn(data, damping=damping, family="polynomial", time_budget=None)
     friction = found.system.friction
     assert 0 <= friction.largest < 0.01
+
+
+def test_terms_without_evidence_are_left_out():
+    theta, precision = np.array([1.0, 0.01, 2.0]), np.diag([1e4, 1e4, 1e4])
+    model = Model(1, (Polynomial("q", [[2], [3], [4]], [1.0]),))
+    left = pruned(Candidate("V", model), theta, precision, values=100)
+    assert left.model.parts[0].exponents.tolist() == [[2], [4]]  # 0.01 is one standard error
+    assert pruned(Candidate("V", model), np.ones(3), precision, values=100) is None
+
+
+def test_outliers_do_not_make_a_robust_fit_loud():
+    """Held-out residuals are judged without their size, which is 100 σ."""
+    runs = trajectories(12, 15, noise=0.01)
+    for _, y in runs:
+        y[1, 7] += 1.0
+    data, held = Trajectories.read(runs).split(0.25)
+    found = fitted(quartic(data), data, Setting(huber=1.5))
+    assert judged(found, held, Setting(huber=1.5)).loudness < 1.3
+    assert judged(found, held, Setting()).loudness > 10

@@ -89,3 +89,14 @@ def test_flows_take_nothing_that_is_known_of_h(learned):
         learn(learned[0], family="sympflow", damping=True)
     with pytest.raises(ValueError, match="leave out `separable` or `family`"):
         learn(learned[0], family="sympflow", separable=True)
+
+
+def test_the_system_of_a_flow_has_the_mean_of_its_own_hamiltonian(learned):
+    _, flow = learned
+    x = torch.tensor([[0.3, -0.2], [0.1, 0.6]], dtype=torch.float64)
+    nodes, weights = np.polynomial.legendre.leggauss(2)
+    mean = sum(w / 2 * flow.hamiltonian(DT * (1 + u) / 2, x) for u, w in zip(nodes, weights, strict=True))
+    assert flow.system.hamiltonian(x.numpy()) == pytest.approx(mean.numpy(), rel=1e-13)
+    e, step = np.array([[1.0, 0.0]]), 1e-5
+    slope = (flow.system.hamiltonian(x.numpy() + step * e) - flow.system.hamiltonian(x.numpy() - step * e)) / (2 * step)
+    assert flow.system.gradient(x.numpy())[:, 0] == pytest.approx(slope, rel=1e-5)

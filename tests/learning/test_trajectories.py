@@ -311,3 +311,41 @@ def test_columns_of_one_name_and_velocities_are_told(columns, message, file, tmp
         data.to_csv(tmp_path / "run.csv", index=False)
     with pytest.raises(ValueError, match=message):
         Trajectories.read(tmp_path / "run.csv" if file else data)
+
+
+def test_dictionaries_of_columns_are_tables():
+    pytest.importorskip("pandas")
+    assert_same(Trajectories.read({"t": t, "q": RUN[0], "p": RUN[1]}), [(t, RUN)])
+    assert_same(Trajectories.read({"t": t, "w": RUN[1], "a": RUN[0]}, q=["a"], p=["w"]), [(t, RUN)])
+
+
+def test_sets_are_divided_by_trajectory_and_long_runs_into_pieces():
+    many = Trajectories.read((t, np.arange(120.0).reshape(10, 2, 6)))
+    kept, held = many.split(0.3, seed=1)
+    firsts = [run.y[0, 0] for run in (*kept.runs, *held.runs)]
+    assert (len(kept.runs), len(held.runs), sorted(firsts)) == (7, 3, [12.0 * i for i in range(10)])
+    again = many.split(0.3, seed=1)[1]
+    assert [run.y[0, 0] for run in again.runs] == [run.y[0, 0] for run in held.runs]
+    one = Trajectories.read((t, RUN))
+    assert [run.n_points for run in one.pieces(points=4).runs] == [4, 2]
+    assert [run.n_points for run in one.pieces(points=5).runs] == [6]  # no piece of one point
+    assert [run.n_points for run in one.pieces(span=0.4).runs] == [3, 3]
+    assert [run.n_points for run in one.pieces(span=1e-9).runs] == [2, 2, 2]
+    assert np.array_equal(np.concatenate([run.y for run in one.pieces(span=0.4).runs], 1), RUN)
+    with pytest.raises(ValueError, match="one trajectory only"):
+        one.split()
+    with pytest.raises(ValueError, match="`points` must be an integer, 2 or more"):
+        one.pieces(points=1)
+
+
+def test_of_few_trajectories_each_is_left_out_in_turn():
+    many = Trajectories.read((t, np.arange(240.0).reshape(20, 2, 6)))
+    ((kept, held),) = many.subset(range(8)).folds(0.2)
+    assert (len(kept.runs), len(held.runs)) == (5, 3)  # three at least
+    ((kept, held),) = many.folds(0.2)
+    assert (len(kept.runs), len(held.runs)) == (16, 4)
+    folds = many.subset(range(3)).folds()
+    assert [[run.y[0, 0] for run in held.runs] for _, held in folds] == [[0.0], [12.0], [24.0]]
+    assert [[run.y[0, 0] for run in kept.runs] for kept, _ in folds] == [[12.0, 24.0], [0.0, 24.0], [0.0, 12.0]]
+    with pytest.raises(ValueError, match="one trajectory only"):
+        many.subset([0]).folds()

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 import sympflow
-from sympflow.learning.families import FAMILIES, Constraints
+from sympflow.learning.families import FAMILIES, Constraints, families
 from sympflow.learning.fitting import Setting, fitted
 from sympflow.learning.lagrangian import lagrangian_start
 from sympflow.learning.learner import constraints_of
-from sympflow.learning.models import friction
-from sympflow.learning.parts import Fixed, Polynomial, kinetic
+from sympflow.learning.models import Model, friction
+from sympflow.learning.orbits import first_states
+from sympflow.learning.parts import Fixed, Polynomial, kinetic, known_kinetic
 from sympflow.learning.trajectories import Trajectories
 from sympflow.systems import double_pendulum
 
@@ -166,3 +167,19 @@ def test_momenta_are_those_of_velocities(system, v):
     q = 0.3 * np.ones((1, system.ndof))
     found = system.vector_field(np.concatenate([q, system.momenta(q, np.array(v))], axis=1))[:, : system.ndof]
     assert found == pytest.approx(np.array(v), abs=1e-12)
+
+
+def test_the_first_velocity_is_the_slope_of_the_positions():
+    data, y = observations(PENDULUM, "q")
+    starts = first_states(data, Model(1, (known_kinetic(np.eye(1)),), velocities=True), np.zeros(0))
+    assert starts[:, 1] == pytest.approx(2 * y[:, 1, 0], abs=0.02)  # of a cubic over 0.36
+
+
+def test_families_are_those_that_velocities_tell():
+    constraints = Constraints(np.ones(4), None, None, None, np.full(4, np.inf), velocities=True, middle=np.zeros(2))
+    assert families(constraints, None) == ["central", "pairs", "waves", "polynomial", "network", "inertia", "magnetic"]
+    assert "magnetic" not in families(replace(constraints, velocities=False), None)
+    with pytest.raises(ValueError, match="`family` 'whole-polynomial' does not apply"):
+        families(constraints, "whole-polynomial")
+    for known, parts in ((None, 2), (np.eye(2), 1)):
+        assert len(replace(constraints, inverse_mass=known).kinetic()) == parts

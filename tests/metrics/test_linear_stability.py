@@ -8,7 +8,7 @@ import pytest
 
 from sympflow import HamiltonianSystem, get, max_energy_error, solve, systems
 from sympflow.metrics.linear_stability import half_trace, linear_stability, of_method, small_oscillations
-from sympflow.schemes import SCHEMES, compose
+from sympflow.schemes import SCHEMES, Scheme, compose
 
 pytestmark = pytest.mark.filterwarnings("ignore:`dt` .* is too long:RuntimeWarning")
 
@@ -158,3 +158,9 @@ def test_windows_of_several_frequencies_are_united():
     assert both.window_of(a).stop == b
     assert found.in_steps([]).limit == math.inf
     assert found.in_steps([4.0]).limit == a / 4
+
+
+def test_an_inconsistent_table_is_unstable_from_the_beginning():
+    backwards = Scheme("x", None, (-1.0,), (1.0,), (0.0,), "")
+    assert linear_stability(backwards).limit == 0
+    assert linear_stability(backwards).intervals == ()

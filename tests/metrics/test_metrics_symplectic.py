@@ -181,3 +181,18 @@ def test_symplectic_methods_carry_a_loop_with_its_area():
     assert np.abs(loop_area_error(sol)).max() < 1e-12
     damped = solve(system, Damped(dt=0.5, factor=0.99), (0, 20), circle(256), t_eval=t)
     np.testing.assert_allclose(loop_area_error(damped), 0.99 ** (t / 0.5) - 1, rtol=1e-9, atol=1e-14)
+
+
+def test_loops_are_checked():
+    with pytest.raises(ValueError, match="`sol` must have one degree of freedom"):
+        loop_area_error(solve(systems.henon_heiles(), "verlet", (0, 1)))
+    with pytest.raises(ValueError, match="`sol` must start from a loop"):
+        loop_area_error(solve(systems.pendulum(), "verlet", (0, 1)))
+    with pytest.raises(ValueError, match="without area"):
+        loop_area_error(solve(systems.pendulum(), "verlet", (0, 1), np.ones((16, 2))))
+
+
+def test_an_unresolved_loop_warns():
+    sol = solve(systems.pendulum(), "verlet", (0, 200), circle(16, radius=0.7), t_eval=[200])
+    with pytest.warns(RuntimeWarning, match="too stretched"):
+        loop_area_error(sol)

@@ -93,3 +93,36 @@ def test_a_missing_library_is_asked_for(monkeypatch, tmp_path, library):
             call()
     with pytest.raises(TypeError, match="`energy` must be True or False"):
         sol.to_xarray(energy="no")
+
+
+@needs_data
+def test_tables_of_ensembles():
+    how = {"params": {"k": [1.0, 2.0]}}
+    states = STATES.reshape(6, 4)
+    result = sympflow.ensemble(OSCILLATOR, "verlet", (0, 1), states, t_eval=TIMES, **how)
+    table = result.to_dataframe()
+    assert [*table] == ["k", "orbit", "time", "q1", "q2", "p1", "p2", "status"]
+    assert np.array_equal(table[table.k == 2].q2.to_numpy().reshape(6, 3), result.y[1, :, 1])
+    ends = sympflow.ensemble(OSCILLATOR, "verlet", (0, 1), states, reduce="final", **how).to_dataframe()
+    assert [*ends] == ["k", "orbit", *("q1", "q2", "p1", "p2"), "status", *("q1_0", "q2_0", "p1_0", "p2_0")]
+    assert np.array_equal(ends.q1_0, np.tile(states[:, 0], 2))
+    own = sympflow.ensemble(
+        OSCILLATOR, "verlet", (0, 1), states, reduce=lambda t, y: {"low": y.min(), "ends": y[:2, [0, -1]]}
+    ).to_dataframe()
+    assert [*own][:6] == ["orbit", "low", "ends_0_0", "ends_0_1", "ends_1_0", "ends_1_1"]
+    assert np.array_equal(own.ends_0_0, states[:, 0])
+
+
+@needs_data
+def test_driven_damped_and_trained_systems_say_so():
+    driven = sympflow.HamiltonianSystem.from_sympy(
+        "p**2/2 + q**2/2 - A*q*cos(t)", time="t", params={"A": 0.3}, damping=0.2, dt=0.1
+    )
+    sol = sympflow.solve(driven, "verlet", (0, 1), [1.0, 0.0])
+    data = sol.to_xarray()
+    assert data.attrs["damping"] == "0.2"
+    assert np.array_equal(data.energy, [driven.hamiltonian(y, t) for y, t in zip(sol.states, sol.t, strict=True)])
+    scene = sympflow.systems.henon_heiles()
+    told = sympflow.solve(scene, "sympflow", (0, 1), [0.1] * 4).to_xarray().attrs
+    assert len(told["flow_checksum"]) == 64
+    assert told["method"] == "sympflow"

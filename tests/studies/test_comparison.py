@@ -9,7 +9,7 @@ import pytest
 
 from sympflow import HamiltonianSystem, compare, get, reference_error, solve, systems
 from sympflow.metrics.reference import Reference
-from sympflow.studies.attempts import Row
+from sympflow.studies.attempts import Row, interleaved
 from sympflow.studies.comparison import matched
 
 QUICK = {"n_outputs": 50, "repeats": 1}
@@ -195,3 +195,33 @@ def test_a_row_lists_its_figures_for_completion():
     assert row.energy_error == 1e-3
     assert row.volume_error is None
     assert {"energy_error", "volume_error", "run_time"} <= set(dir(row))
+
+
+@pytest.mark.parametrize("what", ["evaluations", "energy_error"])
+def test_methods_are_matched_to_the_first(what):
+    report = compare(systems.pendulum(), ["verlet", "yoshida4", "rk45"], match=what, t_span=(0, 50), **QUICK)
+    cost = [row.force_evaluations if what == "evaluations" else row.energy_error for row in report.rows]
+    assert cost[1] == pytest.approx(cost[0], rel=0.1)
+    assert cost[2] == pytest.approx(cost[0], rel=0.15)
+
+
+def test_a_solution_may_be_the_reference():
+    system, t = systems.pendulum(), np.arange(1, 51) / 5
+    truth = solve(system, "kahan_li8", (0, 10), t_eval=t)
+    report = compare(system, ["verlet"], ["error"], t_span=(0, 10), reference=truth, **QUICK)
+    verlet = solve(system, "verlet", (0, 10), t_eval=t)
+    assert report.rows[0].error == reference_error(verlet, truth).max()
+    assert report.reference.method == "given"
+
+
+def test_json_is_strict_where_a_run_blew_up(tmp_path):
+    report = compare(systems.harmonic_oscillator(), [get("verlet")(dt=2.1)], ["energy"], t_span=(0, 5000), **QUICK)
+    content = json.loads(report.to_json(tmp_path / "rows.json").read_text(), parse_constant=pytest.fail)
+    assert content["rows"][0]["energy_error"] == "inf"
+
+
+def test_repeats_are_interleaved():
+    order = []
+    times = interleaved([lambda: order.append("a"), lambda: order.append("b")], 3)
+    assert order == list("ababab")
+    assert len(times) == 2

@@ -55,3 +55,8 @@ def test_the_largest_error_does_not_depend_on_how_the_interval_fits_the_period(p
 def test_an_interval_whose_parts_add_up_to_more_is_compared():
     (row,) = compare(systems.pendulum(), ["verlet"], ["energy"], t_span=(0, 5069.138371433539), repeats=1).rows
     assert row.status == "ok"
+
+
+def test_they_are_ends_of_steps_where_these_are_short():
+    steps = instants(0.0, 100.0, 1000, 0.01) / 0.01
+    np.testing.assert_allclose(steps, np.rint(steps), rtol=0, atol=1e-9)

@@ -228,3 +228,20 @@ def test_a_plane_in_a_driven_system_is_crossed_at_the_times_that_events_find():
     assert len(section) == len(sol.t_events[0]) > 1
     np.testing.assert_allclose(section.t, sol.t_events[0], atol=1e-12)
     np.testing.assert_allclose(section.states, sol.y_events[0], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "answer"),
+    [
+        ({"energy": -1.0}, "`energy` -1 is below"),
+        ({"energy": 0.1, "y0": systems.henon_heiles().y0}, "`energy` and `y0`"),
+        ({"n": 4}, "`n` orbits are drawn for an `energy`"),
+        ({"energy": np.nan}, "`energy` must be a finite number"),
+        ({"energy": 10**400}, "`energy` must be a finite number"),
+        ({"energy": 0.1, "period": 1.0}, "`period` and `energy`"),
+        ({"n": 4, "period": 1.0}, "`period` and `n`"),
+    ],
+)
+def test_energies_are_checked(arguments, answer):
+    with pytest.raises(ValueError, match=answer):
+        poincare_section(systems.henon_heiles(), "verlet", (0, 1), **arguments)

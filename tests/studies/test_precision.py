@@ -8,7 +8,7 @@ import pytest
 
 from sympflow import HamiltonianSystem, SympFlow, compare, get, systems, work_precision
 from sympflow.studies.attempts import Row
-from sympflow.studies.precision import break_even
+from sympflow.studies.precision import break_even, cost_at
 
 pytestmark = pytest.mark.filterwarnings("ignore:`dt` .* is too long:RuntimeWarning")
 
@@ -152,3 +152,16 @@ def test_training_has_paid_for_itself_when_the_time_saved_is_that_of_training():
     *_, quick, never = break_even([*rival, flow, slow], length=100.0)
     assert quick.break_even == pytest.approx(60 / ((10 - 4) / 100))
     assert never.break_even == math.inf
+
+
+def test_cost_is_interpolated_between_points_of_a_power_law():
+    law = [Row("s", "m", "m", run_time=e**-0.5, figures={"energy_error": e}) for e in (1e-2, 1e-4, 1e-6)]
+    assert cost_at(law, 1e-3) == pytest.approx(1e-3**-0.5)
+    assert cost_at(law, 1.0) == pytest.approx(10)  # nothing cheaper is known
+    assert cost_at(law, 1e-7) == math.inf
+
+
+def test_force_gradients_are_counted_apart():
+    row = work_precision(systems.pendulum(), ["chin4a"], steps=[0.1], **QUICK).rows[0]
+    assert row.hessian_evaluations == 100
+    assert row.force_evaluations == 200 + 10

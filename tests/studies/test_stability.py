@@ -1,5 +1,6 @@
 """stability(): the limits that are known, blow-ups told apart, and what is refused."""
 
+import csv
 import json
 import math
 import re
@@ -10,7 +11,7 @@ import torch
 
 import sympflow
 from sympflow import HamiltonianSystem, max_energy_error, solve, stability, systems
-from sympflow.studies.step_stability import blow_up
+from sympflow.studies.step_stability import blow_up, initial_states
 
 pytestmark = pytest.mark.filterwarnings("ignore:`dt` .* is too long:RuntimeWarning")
 
@@ -276,3 +277,50 @@ def test_the_bound_is_missed_where_the_orbit_of_the_map_has_a_short_period():
         sol = solve(systems.harmonic_oscillator(), "verlet", (0.0, 100 * n * z), [1.0, 0.0], dt=z)
         share = max(math.sin(2 * math.pi * k / n) ** 2 for k in range(n))
         assert max_energy_error(sol) == pytest.approx(share * z**2 / 4, rel=1e-10)
+
+
+def test_initial_states_lie_on_one_orbit():
+    system = systems.kepler(0.9)
+    states = initial_states(system, None)
+    assert states.shape == (4, 4)
+    np.testing.assert_array_equal(states[0], system.y0)
+    np.testing.assert_allclose(system.hamiltonian(states), -0.5, rtol=1e-8)
+    given = np.ones((3, 4))
+    np.testing.assert_array_equal(initial_states(system, given), given)
+
+
+@pytest.mark.parametrize(
+    ("method", "span"),
+    [
+        ("verlet", {}),
+        pytest.param(
+            "gauss_legendre4",
+            {"t_span": (0.0, 20.0), "min_steps": 200},
+            marks=pytest.mark.slow,  # by arrays: dear
+        ),
+    ],
+)
+def test_both_precisions_and_every_metric(tmp_path, method, span):
+    report = stability(systems.pendulum(), [method], steps=[0.1], dtypes=["float64", "float32"], **span)
+    double, single = report.rows
+    assert (double.dtype, single.dtype) == ("float64", "float32")
+    assert double.symplecticity_defect < 1e-14 < single.symplecticity_defect < 1e-5
+    assert double.volume_error < 1e-12 < single.volume_error < 1e-3
+    assert double.status == single.status == "stable"
+    assert abs(double.energy_drift) < 5 * double.energy_drift_error + 1e-9
+    path = report.to_csv(tmp_path / "rows.csv")
+    with path.open() as file:
+        rows = list(csv.DictReader(file))
+    assert [float(row["energy_error"]) for row in rows] == [row.energy_error for row in report.rows]
+    assert "longest stable step" in report.table()
+
+
+def test_a_flow_is_run_up_to_its_dt_and_refused_beyond():
+    report = stability(systems.pendulum(), ["sympflow"], metrics=("energy", "domain"))
+    dt = solve(systems.pendulum(), "sympflow", (0, 1)).stats["dt"]
+    assert [row.dt for row in report.rows] == [dt / 4, dt / 2, dt]
+    assert report.limits[0].stable == dt
+    assert report.limits[0].reached == "all up to the flow's Δt"
+    (row,) = stability(systems.pendulum(), ["sympflow"], steps=[2 * dt]).rows
+    assert row.status == "not applicable"
+    assert row.reason.startswith("`dt` must be at most the flow's Δt")

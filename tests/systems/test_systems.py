@@ -384,3 +384,25 @@ def test_every_scene_is_documented(name):
     assert f"::: sympflow.systems.{SYSTEMS[name].__name__}\n" in (docs / "reference" / "systems.md").read_text(
         encoding="utf-8"
     )
+
+
+def test_the_argon_crystal_is_that_of_the_book():
+    system = ARGON
+    assert system.hamiltonian(system.y0) == pytest.approx(-1260.2, abs=0.05)
+    sol = solve(system, "verlet", (0, 0.02))
+    assert max_energy_error(sol) * 1260.2 < 10  # figure I.4.1 of the book: a few kelvin
+    assert sol.stats["backend"] == "compiled"
+
+
+def test_fput_exchanges_energy_among_the_stiff_springs_and_keeps_its_sum():
+    """Hairer, Lubich, Wanner, figure I.5.2: I₂ rises to about one half while I stays near 1."""
+    system = systems.fput()
+    sol = solve(system, "kahan_li8", dt=0.004, save_every=25)
+    stiff = systems.oscillatory_energies(system, sol.states)
+    assert stiff.shape == (len(sol.t), 3)
+    assert abs(stiff.sum(-1) - 1).max() == pytest.approx(0.065, abs=0.003)
+    assert stiff[:, 1].max() == pytest.approx(0.519, abs=0.01)
+    assert max_energy_error(sol) < 1e-9
+    assert system.domain.contains(sol.states).all()
+    with pytest.raises(ValueError, match=r"^`system` must be fput"):
+        systems.oscillatory_energies(systems.quartic(), np.zeros(4))

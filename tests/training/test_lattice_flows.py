@@ -7,7 +7,7 @@ import pytest
 
 import sympflow
 from sympflow import Box, HamiltonianSystem, LatticeStates, SympFlow, solve, train
-from sympflow.training import table_fit
+from sympflow.training import lattice_fit, table_fit
 from sympflow.training.lattice_fit import TAIL, LatticeSubsystem
 
 BOND = "r**2/2 + r**4/4"
@@ -142,3 +142,28 @@ def test_a_fit_to_long_runs_keeps_the_energy_of_other_states(flow, monkeypatch):
     assert errors[1] < errors[0]
     numbers = [further.scheme(t).drifts for t in (0.2, 0.25)]
     np.testing.assert_allclose(*numbers, atol=0.02)
+
+
+def test_the_flow_of_a_damped_lattice_is_of_its_friction():
+    lattice = ring(20, damping=0.1, domain=LatticeStates(0.2))
+    flow = train(lattice, flow=SympFlow.primed(lattice, 2, dt=0.25, processor=0), **FIT)
+    y0 = np.full(60, 0.1)
+    assert solve(ring(30, damping=0.1), flow, (0, 5), y0, backend="array").success
+    for other in (ring(30, damping=0.2), ring(30)):
+        with pytest.raises(ValueError, match="its friction is another"):
+            solve(other, flow, (0, 5), y0)
+
+
+def test_a_table_that_overflowed_is_as_bad_as_can_be(flow):
+    """And is left out of the flow: a search that took too long a step goes on."""
+    lattice = ring(12, domain=LatticeStates(0.2))
+    mine = flow.of_any_size(lattice)
+    runs = lattice_fit.EnergyRuns(mine, lattice, lattice.domain.sample(2), 0.0, 1.0)
+    offset, design = runs.table.polynomial(np.array([flow.dt]))
+    theta = runs.table.frozen_parameters(offset[0] + design[0] @ runs.table.parameters())
+    before = runs.residuals(theta)
+    after = runs.residuals(np.full_like(theta, np.nan))
+    assert np.isfinite(before).all()
+    assert after.shape == before.shape
+    assert np.isinf(after).all()
+    np.testing.assert_array_equal(runs.residuals(theta), before)

@@ -107,3 +107,19 @@ def test_progress_shows_only_when_asked(row, capsys):
     assert capsys.readouterr() == ("", "")
     train(system, **options | {"progress": True})
     assert capsys.readouterr().err
+
+
+LARGEST = {"primed": ("one_step_error", 1e-4), "split": ("missed_share", 0.1)}  # after half of the starts
+
+
+@SOME
+def test_an_interrupted_run_returns_its_best_state(row):
+    system, options, last = ROWS[row]
+    half = last // 2
+    with pytest.warns(RuntimeWarning, match=rf"after {half} of {last} (steps|starts) because it was interrupted"):
+        flow = train(system, callback=at(half, KeyboardInterrupt), **options)
+    stage = flow.recipe["stages"][-1]
+    assert stage.get("steps_taken", stage.get("restarts_taken")) == half
+    assert stage["ended_early"] == "it was interrupted"
+    name, bound = LARGEST.get(row, ("residual_loss", flow.history[0].get("residual_loss")))
+    assert flow.figures[name] < bound

@@ -251,3 +251,13 @@ def test_a_system_that_is_not_separable():
     assert flow.history[-1]["loss"] < flow.history[0]["loss"] / 4
     A = torch.autograd.functional.jacobian(lambda x: flow(3.2, x), torch.tensor([0.4, 0.3], dtype=torch.float64))
     assert torch.linalg.det(A).item() == pytest.approx(1, abs=1e-13)
+
+
+def test_a_weight_of_zero_leaves_a_loss_out():
+    flow, system, sample = SympFlow(1), harmonic_oscillator(), points()
+    L1, L2, _ = Loss(system, Scaling.unit(1), 2.0, 0.0).terms(flow, sample)
+    assert L2 is None
+    assert Loss(system, Scaling.unit(1), 2.0, 0.0)(flow, sample) == 2 * L1
+    L1, L2, _ = Loss(system, Scaling.unit(1), 0.0, 3.0).terms(flow, sample)
+    assert L1 is None
+    assert Loss(system, Scaling.unit(1), 0.0, 3.0)(flow, sample) == 3 * L2

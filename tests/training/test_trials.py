@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from sympflow import max_energy_error, solve, systems, train
+from sympflow.kernels.splitting_loops import splitting_loops
 from sympflow.training import trials
 from sympflow.training.least_squares import Minimum
 from sympflow.training.points import Stream, states
@@ -132,3 +133,17 @@ def test_the_error_of_a_trial_is_that_of_its_orbits(monkeypatch):
     y0, t_span = PENDULUM.domain.sample(20, 1), (0, trials.LENGTH * start.dt)
     sol = solve(PENDULUM, flow, t_span, y0=y0, on_domain_exit="ignore", backend="array")
     assert 0.1 < error / np.median(max_energy_error(sol)) < 10
+
+
+@pytest.mark.parametrize("unit", [1e-15, 1.0, 1e4])
+def test_steps_divide_round_times(unit):
+    for dt in np.geomspace(0.01, 9.9, 40) * unit:
+        steps = 100 * unit / trials.dividing(dt)
+        assert steps == pytest.approx(round(steps), rel=1e-12)
+        assert abs(np.log2(trials.dividing(dt) / dt)) <= 0.5 + 1e-12
+
+
+@pytest.mark.parametrize("system", [HH, PENDULUM, systems.quartic()], ids=lambda s: s.name)
+def test_each_term_makes_a_kick_dearer(system):
+    cycles = [splitting_loops(system).kick_cycles(level) for level in range(3)]
+    assert 0 < cycles[0] < cycles[1] < cycles[2]
