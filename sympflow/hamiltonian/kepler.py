@@ -56,7 +56,8 @@ def stumpff(X: Any, beta: Any) -> tuple[Any, Any, Any, Any]:
     """G₀ to G₃ of any X: the series of X halved so often that it is short, and the theorem of the double argument."""
 
     def halved(part: Any) -> tuple[Any, Numbers]:
-        large = apply("abs", beta * part * part) > SHORT
+        size = apply("abs", beta * part * part)
+        large = (size > SHORT) & (size < math.inf)
         return large, [where(large, 0.5 * part, part)]
 
     def doubled(part: Any, *G: Any) -> tuple[Any, Numbers]:
@@ -89,23 +90,50 @@ def repeated(body: Callable[..., tuple[Any, Numbers]], values: Numbers) -> Numbe
     return values
 
 
-def solved(r: Any, eta: Any, zeta: Any, beta: Any, mu: Any, t: Any) -> Any:
+def falling(x: Sequence[Any], v: Sequence[Any], eta: Any, zeta: Any, beta: Any, mu: Any) -> Numbers:
+    """Where a body falls from far out on a hyperbola; √−β = k, A and B of its distance (Aeᵏˣ + Be⁻ᵏˣ − 2μ)/2k²."""
+    k = apply("sqrt", where(beta < 0.0, -beta, 1.0))
+    turn = [x[i] * v[j] - x[j] * v[i] for i, j in ((1, 2), (2, 0), (0, 1))]
+    falls = (beta < 0.0) & (2.0 * k * eta < -zeta)
+    B = where(falls, zeta - eta * k, 1.0)
+    return [falls, k, (mu * mu + k * k * dot(turn, turn)) / B, B]
+
+
+def reached(
+    X: Any, G: Sequence[Any], r: Any, eta: Any, zeta: Any, mu: Any, t: Any, fall: Sequence[Any] = ()
+) -> tuple[Any, Any]:
+    """The time of X less t, and the distance there; with those of `falling` without sums that cancel."""
+    _, G1, G2, G3 = G
+    late, distance = fma(r, X, -t) + (eta * G2 + zeta * G3), r + (eta * G1 + zeta * G2)
+    if not fall:
+        return late, distance
+    falls, k, A, B = fall
+    p = apply("exp", where(falls, k * X, 0.0))
+    up, down = 0.5 * A * p, 0.5 * B / p
+    square = k * k
+    return (
+        where(falls, ((up - down) / k - (mu * X + eta)) / square - t, late),
+        where(falls, (up + down - mu) / square, distance),
+    )
+
+
+def solved(r: Any, eta: Any, zeta: Any, beta: Any, mu: Any, t: Any, *fall: Any) -> Any:
     """The X of a time t ≥ 0 by Laguerre's method, kept between the ends that are known; nearly to rounding."""
-    bound = where(beta > 0.0, beta, 1.0)
-    most = where(beta > 0.0, (bound * t / mu) + 2.0 / apply("sqrt", bound), math.inf)  # E grows by nt + 2 at most
+    k = apply("sqrt", where(apply("abs", beta) > 0.0, apply("abs", beta), 1.0))
+    n = k * k * k / mu
+    free = 3.0 + apply("log", (1.0 + 8.0 * n * t) * where(beta < 0.0, zeta / mu, 1.0))  # H is less, as sinh H − H ≤ nt
+    most = where(beta > 0.0, n * t + 2.0, where(beta < 0.0, free, math.inf)) / k  # E grows by nt + 2 at most
 
     def turn(X: Any, low: Any, high: Any, going: Any) -> tuple[Any, Numbers]:
-        G0, G1, G2, G3 = stumpff(X, beta)
-        f = r * X + eta * G2 + zeta * G3 - t
-        slope, bend = r + eta * G1 + zeta * G2, eta * G0 + zeta * G1
+        G = stumpff(X, beta)
+        f, slope = reached(X, G, r, eta, zeta, mu, t, fall)
+        bend = eta * G[0] + zeta * G[1]
         before = f < 0.0
         low, high = where(before, X, low), where(before, high, X)
         root = apply("sqrt", apply("abs", 16.0 * slope * slope - 20.0 * f * bend))
         new = X - 5.0 * f / (slope + root)
         between = where(high < math.inf, 0.5 * (low + high), 2.0 * X)
-        even = apply("floor", 0.5 * going) * 2.0 == going
-        slow = (going < MOST - 20.0) & even  # far out on a hyperbola a step shortens √−β X by 5/3 only
-        new = where(slow, between, where((low <= new) & (new <= high), new, between))
+        new = where((low <= new) & (new <= high), new, between)
         again = (CLOSE * apply("abs", new) < apply("abs", new - X)) & (going > 0.0)
         return again, [where(going > 0.0, new, X), low, high, where(again, going - 1.0, 0.0)]
 
@@ -113,11 +141,22 @@ def solved(r: Any, eta: Any, zeta: Any, beta: Any, mu: Any, t: Any) -> Any:
     return repeated(turn, [first, 0.0 * first, most + 0.0 * first, 0.0 * first + float(MOST)])[0]
 
 
-def coefficients(X: Any, G: Sequence[Any], r: Any, inverse: Any, eta: Any, zeta: Any, mu: Any, t: Any) -> Numbers:
+def coefficients(
+    X: Any,
+    G: Sequence[Any],
+    r: Any,
+    inverse: Any,
+    eta: Any,
+    zeta: Any,
+    mu: Any,
+    t: Any,
+    fall: Sequence[Any] = (),
+) -> Numbers:
     """f − 1, g, f′, g′ − 1 after a step d of Newton's method from X, so short that it is linear; d; g as rG₁ + ηG₂."""
     G0, G1, G2, G3 = G
-    slope = 1.0 / (r + (eta * G1 + zeta * G2))
-    d = -((fma(r, X, -t) + (eta * G2 + zeta * G3)) * slope)
+    late, distance = reached(X, G, r, eta, zeta, mu, t, fall)
+    slope = 1.0 / distance
+    d = -(late * slope)
     end = slope * (1.0 - (slope * d) * (eta * G0 + zeta * G1))
     G1, G2, G3 = G1 + d * G0, G2 + d * G1, G3 + d * G2
     a = mu * G2
@@ -206,10 +245,11 @@ def kepler_changes(x: Sequence[Any], v: Sequence[Any], mu: Any, t: Any, rates: S
     t = t - left_out
     sign = where(t < 0.0, 0.0 * t - 1.0, 1.0)
     forward, along, zeta = t * sign, eta * sign, mu - beta * r
-    X = solved(*map(detached, (r, along, zeta, beta, mu, forward)))
+    fall = falling(x, [sign * a for a in v], along, zeta, beta, mu)
+    X = solved(*map(detached, (r, along, zeta, beta, mu, forward, *fall)))
     G = stumpff(X, beta)
-    f, g, df, dg, d, other = coefficients(X, G, r, inverse, along, zeta, mu, forward)
-    g = where(2.0 * apply("abs", forward - g) < forward, g, other)
+    f, g, df, dg, d, other = coefficients(X, G, r, inverse, along, zeta, mu, forward, fall)
+    g = where(2.0 * apply("abs", forward - g) < apply("max", forward, -2.0 * along * G[2]), g, other)
     c = [f, sign * g, sign * df, dg]
     if not rates:
         return moved(x, v, c)

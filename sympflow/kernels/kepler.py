@@ -472,7 +472,8 @@ def drifted(x: Vectors, v: Vectors, mu: Value, t: Value, r: Any, inverse: Any) -
     worst = code.apply("max", (code.apply("max", (errors[0], errors[1])), 1e16 * (d * d)))
     size = code.apply("abs", (beta * square,))
     late = 2.0 * code.apply("abs", (t - c[1],))
-    bad = (square < worst) | (size > LONGEST) | (code.apply("abs", (t,)) < late)
+    good = (worst <= square) & (size <= LONGEST) & (late <= code.apply("abs", (t,)))  # False of NaN
+    bad = code.apply("not", (good,))
 
     def again() -> Vectors:
         given = [*x, *v, mu, t, *rates]
