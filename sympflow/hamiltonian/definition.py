@@ -50,6 +50,7 @@ class Definition:
     kinetic_timed: bool = False
     shortest_piece: float = inf  # the shortest time between two jumps of H in t
     may_jump: bool = False  # at times, which `jump_times` lists
+    jumps: Any = False  # True of a symbolic H that does
     has_third_derivative: bool = False  # `third_derivative` of all arrays; else by differences
     loops: str = ""  # the compiled loops of a definition by one site or pair: see `sympflow.hamiltonian.local`
     leaps: bool = False  # bodies may meet, over which a step may leap: then there is `leapt`

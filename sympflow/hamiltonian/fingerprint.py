@@ -235,7 +235,7 @@ def _read(expression: str | None, ndof: int) -> Any:
 
     if expression is None:
         return None
-    if (found := written(expression)) is not None:
+    if (found := written(expression) or written(expression, timed=True)) is not None:
         return Hamiltonian("", found, found.inverse_mass, True) if found.ndof == ndof else None
     from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 

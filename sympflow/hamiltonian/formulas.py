@@ -226,11 +226,11 @@ class TracedHamiltonian:
     @cached_property
     def driving(self) -> TracedDriving:
         """The form with coefficients for what depends on the time alone."""
-        (V,), coefficients = without_time([self.V], self.time)
+        (V,), coefficients = without_time([self.V], self.time, self.parameters)
         form = copy.copy(self)
-        form.time, form.parameters = None, tuple(coefficients)
+        form.time, form.parameters = None, (*self.parameters, *coefficients)
         form._set_potential(V)
-        return TracedDriving(form, coefficients)
+        return TracedDriving(form, coefficients, (self.time, *self.parameters))
 
     # arrays, of V in q or of H in [q, p] --------------------------------------------------------------------------
 
@@ -460,16 +460,16 @@ class TracedDriving:
 
     means: tuple[()] = ()
 
-    def __init__(self, form: TracedHamiltonian, coefficients: Mapping[Variable, Formula]) -> None:
-        self.form, self._coefficients = form, coefficients
+    def __init__(self, form: TracedHamiltonian, coefficients: Mapping[Variable, Formula], given: Sequence[Any]) -> None:
+        self.form, self._coefficients, self._given = form, coefficients, given
 
     @property
     def key(self) -> tuple[Any, ...]:
         return tuple(self._coefficients.items())
 
     def values_at(self, time: Any, length: Any, fixed: Sequence[Any]) -> list[Any]:
-        """The coefficients at a time."""
-        return _at_time(self._coefficients, time)
+        """The coefficients at a time, of `fixed` parameters."""
+        return _at_time(self._coefficients, self._given, (time, *fixed))
 
     def check(self) -> None:
         """Do nothing: all that was traced has a compiled form."""
@@ -481,24 +481,30 @@ class TracedCoefficients:
     def __init__(self, form: TracedHamiltonian, expressions: Sequence[Formula]) -> None:
         self.symbols, self.expressions, self.time_coefficients = form, list(expressions), dict[Variable, Formula]()
         if form.time is not None:
-            self.expressions, self.time_coefficients = without_time(expressions, form.time)
+            self.expressions, self.time_coefficients = without_time(expressions, form.time, form.parameters)
         self.given = (*form.parameters, *self.time_coefficients)
 
     def at(self, t: Any, parameters: Sequence[Any]) -> list[Any]:
         """The coefficients at times t."""
-        return _at_time(self.time_coefficients, t)
+        return _at_time(self.time_coefficients, (self.symbols.time, *self.symbols.parameters), (t, *parameters))
 
 
-def _at_time(coefficients: Mapping[Variable, Formula], time: Any) -> list[Any]:
-    """Values of coefficients at a time, common operations once."""
-    together = traced(lambda t: [f.program(t)[0] for f in coefficients.values()], "t")
-    return together(time)
+def _at_time(coefficients: Mapping[Variable, Formula], given: Sequence[Any], numbers: Sequence[Any]) -> list[Any]:
+    """Values of coefficients at a time, with numbers for the parameters, common operations once."""
+
+    def values(*x: Any) -> list[Any]:
+        known = dict(zip(given, x, strict=True))
+        return [f.value(known) for f in coefficients.values()]
+
+    return traced(values, *(s.name for s in given))(*numbers)
 
 
-def without_time(formulas: Sequence[Formula], time: Any) -> tuple[list[Formula], dict[Variable, Formula]]:
-    """Formulas with coefficients for the largest parts that depend on the time alone; these as formulas of it."""
+def without_time(
+    formulas: Sequence[Formula], time: Any, parameters: Sequence[Variable]
+) -> tuple[list[Formula], dict[Variable, Formula]]:
+    """Formulas with coefficients for the largest parts that depend on the time, or parameters, alone."""
     found: dict[Variable, Formula] = {}
-    return [without(f, [time], found, "letter") for f in formulas], found
+    return [without(f, [time, *parameters], found, "letter") for f in formulas], found
 
 
 def without(
@@ -511,6 +517,7 @@ def without(
     """A formula with letters for its largest parts of `fixed` variables alone, or numbers, where there are such."""
     program = f.program
     own_inputs = dict(zip(f.variables, program.inputs, strict=True))
+    fixed = [s for s in fixed if s in own_inputs]
     given = {own_inputs[s].order for s in fixed}
     moving = {x.order for x in program.inputs if x.order not in given}
     for x in program.operations:

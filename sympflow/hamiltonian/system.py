@@ -366,9 +366,9 @@ class HamiltonianSystem(Hamiltonian, Answering):
             other than impulses DiracDelta(t − a)·W(q), which are kicks p −= ∇W(q) at the time a; if `damping` is not
             symmetric, has negative rates, or another shape.
         """
-        plain = isinstance(expression, str) and all(given is None for given in (q, p, time))
+        plain = isinstance(expression, str) and q is None and p is None and time in (None, "t")
         checked = checked_params(params) if plain else {}
-        if plain and (found := written(expression, checked)) is not None:
+        if plain and (found := written(expression, checked, time is not None)) is not None:
             return cls._defined(found, found.inverse_mass, checked, Scene.given(scene), damping, period)
         from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, renamed
 
@@ -908,9 +908,10 @@ class HamiltonianSystem(Hamiltonian, Answering):
         definition, params = self.definition, {**self.params, **values}
         checked = checked_params(params)
         if (found := definition.revalued(checked)) is not None:
-            return HamiltonianSystem._defined(found, found.inverse_mass, checked, self.scene, self.damping)
-        given: dict[str, Any] = {"params": params, "time": definition.named_time, "damping": self.damping}
-        made = HamiltonianSystem.from_sympy(definition.source, **given, **vars(self.scene))
+            made = HamiltonianSystem._defined(found, found.inverse_mass, checked, self.scene, self.damping)
+        else:
+            given: dict[str, Any] = {"params": params, "time": definition.named_time, "damping": self.damping}
+            made = HamiltonianSystem.from_sympy(definition.source, **given, **vars(self.scene))
         # Values of the drive may have changed the period: it is tested where it is asked for.
         made._former_period = self.period or self._former_period
         return made

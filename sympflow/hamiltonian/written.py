@@ -136,6 +136,7 @@ class _Reader:
             raise NotPlain
         if not whole and base.name not in ("input", "add", "sub"):  # as √x², which is |x|
             raise NotPlain
+        self._check_smooth_in_time(base, whole and exponent > 0)
         radicand, exponent = (base.args[0], exponent / 2) if base.name == "sqrt" else (base, exponent)
         if not (whole and exponent > 0) and not ARITHMETIC.issuperset(x.name for x in reached([radicand])):
             raise NotPlain  # functions may overflow, or cancel, as 1 − cos x
@@ -149,10 +150,16 @@ class _Reader:
             return self._power(x, Fraction(1, 2))
         if x.order in self.fixed:
             return self._marked(apply(name, x), [x])
+        self._check_smooth_in_time(x, name not in ("log", "tan"))
         known = {each.name for each in reached([x])}
         if x.order in self.infinite or (name == "log" and known - ARITHMETIC) or (name == "exp" and "log" in known):
             raise NotPlain
         return self._marked(apply(name, x), [x], name == "log")
+
+    def _check_smooth_in_time(self, x: Traced, smooth: bool) -> None:
+        """Leave what may jump, or have a kink, at some times to SymPy, which finds these."""
+        if not smooth and "t" in self.names and self.names["t"] in reached([x]):
+            raise NotPlain
 
     def _marked(self, x: Any, made_of: Sequence[Traced], infinite: bool = False) -> Any:
         if not isinstance(x, Traced):  # terms that cancel
@@ -165,16 +172,17 @@ class _Reader:
 
 
 class _Read(NamedTuple):
-    """H of a text in q1 … pd and letters for parts that depend on parameters alone; those that are 0, 1 or −1 in H."""
+    """H of a text in t, q1 … pd and letters for parts that depend on parameters alone; those that are 0, ±1 in H."""
 
+    timed: bool
     ndof: int
     H: Formula
     letters: dict[Variable, Formula]
     lasting: list[Formula]
 
 
-def _read(text: str, params: Mapping[str, float], names: Sequence[str] | None = None) -> _Read:
-    """Read a text; of `names` the letters are these parameters, whatever their values."""
+def _read(text: str, params: Mapping[str, float], timed: bool, names: Sequence[str] | None = None) -> _Read:
+    """Read a text, `timed` if t is in it; of `names` the letters are these parameters, whatever their values."""
     tree = parsed(text, FUNCTIONS)
     used = {x.id for x in ast.walk(tree) if isinstance(x, ast.Name)}
     spelled = [unicodedata.normalize("NFKC", name) for name in params]
@@ -184,15 +192,18 @@ def _read(text: str, params: Mapping[str, float], names: Sequence[str] | None = 
     if not 0 < d <= MOST_DEGREES or not (numbered or coordinates <= {"q", "p"}) or not used.issuperset(spelled):
         raise NotPlain
     recording = Recording()
+    times = [recording.input("t")] if timed else []
     states = [recording.input(f"{letter}{i + 1}") for letter in "qp" for i in range(d)]
     own = [recording.input(name) for name in params]
     known = dict(zip(map(repr, states) if numbered else "qp", states, strict=True))
+    known |= dict(zip(["t"], times, strict=False))
     y = _Reader(known, dict(zip(spelled, own, strict=True))).value(tree)
     within = {x.order for x in reached([y])}
-    if not within.issuperset(x.order for x in own) or any(within.isdisjoint({i, d + i}) for i in range(d)):
+    unused = [i for i in range(d) if within.isdisjoint({states[i].order, states[d + i].order})]
+    if unused or not within.issuperset(x.order for x in (*times, *own)):
         raise NotPlain
-    variables = [Variable(name) for name in (*map(repr, states), *params)]
-    parameters, lasting, found = variables[2 * d :], list[Formula](), dict[Variable, Formula]()
+    variables = [Variable(name) for name in (*map(repr, (*times, *states)), *params)]
+    parameters, lasting, found = variables[timed + 2 * d :], list[Formula](), dict[Variable, Formula]()
 
     def value(part: Formula) -> float:
         (number,) = values_of([part], params)
@@ -207,27 +218,29 @@ def _read(text: str, params: Mapping[str, float], names: Sequence[str] | None = 
         lasting.append(part)
         return number
 
-    H = Formula(Program([*states, *own], [y]), variables)
+    H = Formula(Program([*times, *states, *own], [y]), variables)
     if names is None:
-        return _Read(d, without(H, parameters, found, "parameter", fixed), found, lasting)
+        return _Read(timed, d, without(H, parameters, found, "parameter", fixed), found, lasting)
     found = {s: Formula(Program([x], [x]), [s]) for s, x in zip(parameters, own, strict=True) if s.name in names}
-    return _Read(d, without(H, [s for s in parameters if s not in found], {}, "", value), found, lasting)
+    return _Read(timed, d, without(H, [s for s in parameters if s not in found], {}, "", value), found, lasting)
 
 
 def _lettered(read: _Read, params: Mapping[str, float]) -> TracedHamiltonian:
     """The form of H = ½ pᵀM⁻¹p + V(q) with its letters as parameters."""
-    (H,), inputs, d = read.H.program.outputs, read.H.program.inputs, read.ndof
+    (H,), inputs, d, n = read.H.program.outputs, read.H.program.inputs, read.ndof, read.timed + 2 * read.ndof
     letters, values = [*read.letters], values_of([*read.letters.values()], params)
-    states, own = inputs[: 2 * d], inputs[2 * d :]
-    _, M = kinetic_matrix(H, states, d, own, values)
-    if M is None or len(Program(inputs, gradient(H, states))) > MOST_OPERATIONS:
+    own, within = inputs[n:], {x.order for x in reached([H])}
+    _, M = kinetic_matrix(H, inputs[:n], d, own, values)
+    if M is None or len(Program(inputs, gradient(H, inputs[read.timed : n]))) > MOST_OPERATIONS:
+        raise NotPlain
+    if read.timed and inputs[0].order not in within:  # by the values of parameters
         raise NotPlain
     rows = [[Formula(Program(own, [x]), letters) if isinstance(x, Traced) else x for x in row] for row in M]
     rest = [0.0] * d
-    V = traced(lambda *x: read.H.program(*x[:d], *rest, *x[d:]), *map(repr, (*inputs[:d], *own)))
+    V = traced(lambda *x: read.H.program(*x[: n - d], *rest, *x[n - d :]), *map(repr, (*inputs[: n - d], *own)))
     if not isinstance(V.outputs[0], Traced):
         raise NotPlain
-    return TracedHamiltonian(d, V, True, rows, parameters=letters, values=values)
+    return TracedHamiltonian(d, V, True, rows, read.timed, parameters=letters, values=values)
 
 
 class TextForm(TracedHamiltonian):
@@ -235,8 +248,9 @@ class TextForm(TracedHamiltonian):
 
     def __init__(self, of: WrittenHamiltonian) -> None:
         lettered, numbers = of.lettered, of.lettered.values
-        V = traced(lambda *q: lettered.program(*q, *numbers), *(s.name for s in lettered.q))
-        super().__init__(of.ndof, V, True, of.inverse_mass)
+        names = map(repr, lettered.program.inputs[: of.timed + of.ndof])
+        V = traced(lambda *x: lettered.program(*x, *numbers), *names)
+        super().__init__(of.ndof, V, True, of.inverse_mass, of.timed)
         self._of, self.text = of, of.text
 
     @property
@@ -245,7 +259,7 @@ class TextForm(TracedHamiltonian):
 
     def named(self, names: Sequence[str]) -> TracedHamiltonian:
         """The form with these parameters as letters, whatever their values."""
-        return _lettered(_read(self._of.source, self._of.params, names), self._of.params)
+        return _lettered(_read(self._of.source, self._of.params, self._of.timed, names), self._of.params)
 
     @cached_property
     def written(self) -> SymbolicHamiltonian:
@@ -253,7 +267,7 @@ class TextForm(TracedHamiltonian):
 
         root, own = self._of.root.form, self._of
         found = None if root is self else root.written.revalued(own.params)
-        return SymbolicHamiltonian(own.text, own.params) if found is None else found
+        return SymbolicHamiltonian(own.text, own.params, own.named_time) if found is None else found
 
 
 class Lettered:
@@ -268,7 +282,6 @@ class WrittenHamiltonian(Definition):
     """H = ½ pᵀM⁻¹p + V(q) as a text, by its program; `symbols` are made of the text when they are asked for."""
 
     separable = has_third_derivative = symbolic = True
-    named_time = None
 
     def __init__(
         self,
@@ -281,6 +294,8 @@ class WrittenHamiltonian(Definition):
     ) -> None:
         self.text = self.source = text
         self.params, self.lettered, self.ndof = params, lettered, lettered.ndof
+        self.timed = lettered.time is not None
+        self.named_time = "t" if self.timed else None
         self._meanings, self._lasting, self.root = tuple(meanings), lasting, self if root is None else root
         M, d = lettered.inverse_mass, self.ndof
         assert M is not None
@@ -330,26 +345,32 @@ class WrittenHamiltonian(Definition):
         M = np.eye(self.ndof) if found.inverse_mass is None else found.inverse_mass
         return found if np.linalg.eigvalsh(np.diag(M) if M.ndim == 1 else M)[0] > 0 else None
 
-    def potential(self, q: Array) -> Array:
-        return self.form.value(q)
+    def potential(self, q: Array, *t: Array) -> Array:
+        return self.form.value(q, *t)
 
-    def potential_gradient(self, q: Array) -> Array:
-        return self.form.gradient(q)
+    def potential_gradient(self, q: Array, *t: Array) -> Array:
+        return self.form.gradient(q, *t)
 
-    def potential_hessian(self, q: Array) -> Array:
-        return self.form.hessian(q)
+    def potential_hessian(self, q: Array, *t: Array) -> Array:
+        return self.form.hessian(q, *t)
 
     def hessian_vector(self, q: Array, v: Array, *t: Array) -> Array:
-        return self.form.hessian_vector(q, v)
+        return self.form.hessian_vector(q, v, *t)
 
     def third_derivative(self, q: Array, v: Array, w: Array, *t: Array) -> Array:
-        return self.form.third_derivative(q, v, w)
+        return self.form.third_derivative(q, v, w, *t)
+
+    def time_derivative(self, y: Array, t: Array) -> Array:
+        """∂V/∂t, of which T has no part."""
+        return self.form.time_derivative(y[..., : self.ndof], t)
 
 
-def written(text: str, params: Mapping[str, Any] = MappingProxyType({})) -> WrittenHamiltonian | None:
-    """The definition by the program of a text; None where the text is left to SymPy."""
+def written(
+    text: str, params: Mapping[str, Any] = MappingProxyType({}), timed: bool = False
+) -> WrittenHamiltonian | None:
+    """The definition by the program of a text, `timed` if it depends on t; None where the text is left to SymPy."""
     try:
-        read = _read(text, params)
+        read = _read(text, params, timed)
         lettered = _lettered(read, params)
     except (NotPlain, ArithmeticError, ValueError, TypeError, RecursionError):
         return None

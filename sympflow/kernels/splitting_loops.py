@@ -109,7 +109,7 @@ class SplittingLoops:
             self.abreast = LANES_OF_SUMS if V is not None and V.is_polynomial() and not self.driven else LANES
             self._has_ranges = form.text is not None and self.ndof == 1 and not form.V.is_polynomial()
             if self.driven:
-                driving = self._driving = form.driving
+                driving = self._driving = form.parametric.driving
                 self._form = driving.form
         elif system.numba_functions is not None:
             _, gradient, hessian_vector = system.numba_functions

@@ -74,8 +74,7 @@ def kept_by(system: HamiltonianSystem) -> str:
     """Return the name of what the flow of a system keeps: its "energy", or the "balance" of a drive, or "" for none."""
     if system.keeps_energy:
         return "energy"
-    jumps = system.symbols is not None and system.symbols.jumps
-    return "balance" if system.conservative and not jumps else ""
+    return "balance" if system.conservative and not system.definition.jumps else ""
 
 
 def _balanced(sol: Solution) -> tuple[np.ndarray, np.ndarray]:
