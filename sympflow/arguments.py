@@ -96,7 +96,7 @@ def check_array(y0: Any, but: str, remedy: str = "y0.numpy()") -> None:
 
 
 def check_not_traced(function: str) -> None:
-    """Raise a TypeError in a graph that `torch.compile` traces, into which a whole run does not go."""
+    """Raise a TypeError in a graph that `torch.compile` traces, which cannot contain a whole run."""
     torch = sys.modules.get("torch")
     if torch is not None and torch.compiler.is_dynamo_compiling():
         raise TypeError(

@@ -45,7 +45,7 @@ class Event:
         return number
 
     def crossed(self, before: float, after: float) -> bool:
-        """Return True if the sign changed in the direction that is asked for, from `before` to `after`."""
+        """Return True if the sign changed in the required direction, from `before` to `after`."""
         up, down = before <= 0 <= after, before >= 0 >= after
         return (up and self.direction >= 0) or (down and self.direction <= 0)
 

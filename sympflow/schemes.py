@@ -1,8 +1,8 @@
 """Scheme: a splitting method as a table of numbers.
 
 A separable Hamiltonian H(q, p) = T(p) + V(q) is the sum of two that are solved exactly: the *drift*
-q += a h ∇T(p) and the *kick* p −= b h ∇V(q).  A splitting scheme is a list of kicks and drifts, and this
-module knows nothing else: no system, no array library.
+q += a h ∇T(p) and the *kick* p −= b h ∇V(q).  A splitting scheme is a list of kicks and drifts, and this module depends
+on nothing else: no system, no array library.
 
 When T is quadratic, T = ½ pᵀM⁻¹p, the kick may carry a *force gradient*: stage i is the exact flow over h of
 
@@ -15,7 +15,7 @@ v = M⁻¹∇V (Blanes, Casas and Ros, Appl. Numer. Math. 39 (2001) 245):
 
     + c_i h⁴ ½ v·∇²V(q) v,       p −= c_i h⁵ (∇²V M⁻¹∇²V v + ½ ∇³V(v, v)).
 
-In place of these two a kick may carry a polynomial in q, which no order condition knows: trained flows have them.
+In place of these two a kick may carry a polynomial in q, which has no order condition: trained flows have them.
 
     + h² Σ_m e_im q^m,           p −= h³ Σ_m e_im ∇q^m.
 """

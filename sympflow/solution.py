@@ -371,7 +371,7 @@ def _stored(name: str, read: Callable[[RunStore], Any]) -> property:
 
 
 class StoredSolution(Solution):
-    """A solution whose outputs are in a store, from which `t` and `y` are read whenever they are asked for."""
+    """A solution whose outputs are in a store, from which `t` and `y` are read at each access."""
 
     store: RunStore | None = None
     t = _stored("_t", lambda store: store.times())
@@ -383,7 +383,7 @@ COUNTS = ("backend", "dt", "n_steps", "force_evaluations", "hessian_evaluations"
 
 
 def dataset(sol: Solution, energy: bool = True, asked: str = "to_xarray()") -> xarray.Dataset:
-    """The Dataset of a solution: see `Solution.to_xarray`; `asked` is the call that needs it."""
+    """The Dataset of a solution: see `Solution.to_xarray`; `asked` is the name of the call that needs it."""
     from sympflow.integrators.provenance import provenance
     from sympflow.storage.layout import DOF, TIME, axis_name, batch_dims, described, dofs, halves, imported
 

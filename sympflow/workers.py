@@ -199,7 +199,7 @@ def mapped(
     function : callable
         Of a module, so that its name is enough to find it.
     common : object
-        The first argument of all calls: each worker is sent it, and unpacks it once.
+        The first argument of all calls: each worker receives it, and unpacks it once.
     items : iterable
     workers : int, object with .map, or callable
         See the module's docstring.
@@ -213,13 +213,13 @@ def mapped(
     LostWorkers
         If workers die again and again.
     TimeoutError
-        After `timeout` seconds: what is not begun is cancelled, what is under way is not waited for.
+        After `timeout` seconds: tasks that have not begun are cancelled, running ones are left.
     TypeError
         If the `.map` of `workers` does not return the results.
     Unpicklable
         If processes cannot be sent `common`.
     Exception
-        What `function` raises, at the first item for which it does.
+        The exception of `function` for the first item that fails.
     """
     workers = checked_workers(workers)
     call, left, clock = _Call(function, PickledTask(common)), dict(enumerate(items)), _Clock(timeout)

@@ -138,7 +138,7 @@ def train(
 ) -> None:
     """Train a flow for a system and save it.
 
-    With nothing else said, a system with separable H gets a flow primed with its own V and T, in a minute at most.
+    By default a system with separable H gets a flow primed with its own V and T, in a minute at most.
 
     Any other, or where an option is one of networks, gets a SympFlow with neural potentials.
 
@@ -196,7 +196,7 @@ def certificate(
     ] = None,
     quiet: Quiet = False,
 ) -> None:
-    """Compute the certificate of a flow: what its known Hamiltonian says of its energy error.
+    """Compute the certificate of a flow: estimates of its energy error from its Hamiltonian.
 
     Examples:
 

@@ -120,7 +120,7 @@ def made(scene: str, **params: Any) -> HamiltonianSystem:
 
 @dataclass(frozen=True)
 class Scene:
-    """A system as asked for.
+    """A system as named by the user.
 
     Attributes
     ----------
@@ -128,11 +128,11 @@ class Scene:
         Names its files.
     system : HamiltonianSystem
     t_end : float or None
-        Where it should end, if that was said.
+        The end of the run, if given.
     factory : callable
         Makes the system of other parameters.
     params : dict
-        The parameters that were said.
+        The given parameters.
     """
 
     key: str
@@ -212,7 +212,7 @@ def one_scene(words: Sequence[str] | None, own: Sequence[str] | None = None) -> 
 
 
 def interval(scene: Scene, t_start: float | None, t_end: float | None) -> tuple[float, float]:
-    """From the start that is asked for, or the scene's, to the end: with the scene, by --t-end, or its own."""
+    """From the given start, or the scene's, to the end: with the scene, by --t-end, or its own."""
     start, end = scene.system.t_span
     asked = [at for at in (scene.t_end, t_end) if at is not None]
     if not asked and t_start is not None and (end - t_start) * (end - start) <= 0:
@@ -440,7 +440,7 @@ def state(words: str | None) -> np.ndarray | None:
 
 
 def parsed(option: str, words: str | None, read: Callable[[str], Any], what: str) -> Any:
-    """The value that an option's words are read as, None without any; a ValueError says what they must be."""
+    """The value of an option's words, None without any; a ValueError says what they must be."""
     try:
         return None if words is None else read(words)
     except ValueError as error:

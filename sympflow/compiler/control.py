@@ -454,7 +454,7 @@ class Code:
         return self._new(type, f"call {type} @{name}({given})")
 
     def table(self, table: Table) -> Value:
-        """The address of the numbers of a table, which the linker is told by its symbol."""
+        """The address of the numbers of a table, which the linker inserts for its symbol."""
         symbol = table.symbol
         TABLES.setdefault(symbol, table)  # loaded code reads the first one, whose memory must stay
         self.module.declare(symbol, f"@{symbol} = external global double")
@@ -631,7 +631,7 @@ class Sweep:
         return values[d]
 
     def put(self, key: Any, d: int, x: Value) -> None:
-        """Set the value of a key at the place k + d, the furthest one at which it is asked for."""
+        """Set the value of a key at the place k + d, the furthest one at which it is used."""
         self._types[key] = x.type
         self._values.setdefault(key, {})[d] = x
         self._made.add(key)

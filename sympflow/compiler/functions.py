@@ -24,8 +24,8 @@ __all__ = ["FUNCTIONS", "Function", "added", "apply", "dot", "fma", "is_zero", "
 class Function:
     """A function of real numbers: of arrays by `numpy`, of tensors by its name in torch or a function of these.
 
-    ``partials(y, *x)``, with its value y: the derivative by each argument, 0.0 where there is none. `cost` tells when
-    its value is known, in cycles of a typical processor: the same on every machine, so that programs are. `infix` is
+    ``partials(y, *x)``, with its value y: the derivative by each argument, 0.0 where there is none. `cost` is its
+    latency in cycles of a typical processor: the same on every machine, so that programs are the same too. `infix` is
     its sign between two arguments, as a program prints it.
     """
 

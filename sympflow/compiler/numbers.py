@@ -13,7 +13,7 @@ __all__ = ["Number"]
 
 
 class Number:
-    """A number of a kind: a subclass says in `apply` what an operation of its numbers and floats means."""
+    """A number of a kind: a subclass defines in `apply` the operations of its numbers and floats."""
 
     __slots__ = ()
     __array_ufunc__ = None  # NumPy leaves the operators to this class

@@ -841,7 +841,8 @@ def trace_followed(function: Callable[..., Any], names: Sequence[Sequence[str] |
 
 
 def trace(function: Callable[..., Any], names: Sequence[Sequence[str] | str], torch: bool = False) -> Program:
-    """Record a function of arrays, or of tensors (`torch`), which returns one number; `Untraceable` says why not.
+    """Record a function of arrays, or of tensors (`torch`), which returns one number; raises `Untraceable` if it
+    cannot.
 
     `names` has, for each argument, the names of the elements of an array, or the name of a number.
     """

@@ -1,7 +1,7 @@
 """Reductions: what an ensemble keeps of each orbit instead of its states.
 
 A reduction is a row of `REDUCTIONS`, an instance of a `Reduction` with options, or a user's function of one orbit. It
-sees a `Chunk` of orbits, and walks along them by `chunk.windows()`, or runs loops of its own from `chunk.y0`.
+gets a `Chunk` of orbits, and steps along them by `chunk.windows()`, or runs loops of its own from `chunk.y0`.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class Reduction(ABC):
     """True if it walks along the orbits by loops of its own, from `chunk.y0`."""
 
     def check(self, system: HamiltonianSystem) -> None:  # noqa: B027
-        """Raise ValueError if it has no meaning for a system; of a grid of parameters each value is asked."""
+        """Raise ValueError if it has no meaning for a system, in a grid for each value of the parameters."""
 
     @abstractmethod
     def fields(self, problem: Chunk) -> Fields:
@@ -131,8 +131,8 @@ class EnergyError(Reduction):
 class OfFunction(Reduction):
     """A user's function of (t (m,), y (2d, m)) of one orbit, which returns a number, an array, or a dict of such.
 
-    The shapes are those of the first orbit, and numbers are complex if its are. An orbit for which the function raises,
-    or returns another shape, or imaginary parts where the first has none, has failed, with that message.
+    The shapes are those of the first orbit, and numbers are complex if its are. An orbit fails, with that message, if
+    the function raises, returns another shape, or imaginary parts where the first has none.
     """
 
     function: Callable[[np.ndarray, np.ndarray], Any]

@@ -224,9 +224,9 @@ class Memory:
 class Ensemble(Answering):
     """The result of `ensemble`.
 
-    Every field that was kept of the orbits is an attribute: `y` where nothing was reduced, else what `reduce` says. An
-    axis stands in front of that of the orbits for each of `params` that is an array. From a `store` a field is read
-    whenever it is asked for.
+    Every field that was kept of the orbits is an attribute: `y` without `reduce`, else the fields of `reduce`. An
+    axis stands in front of that of the orbits for each of `params` that is an array. From a `store` a field is read at
+    each access.
 
     Attributes
     ----------

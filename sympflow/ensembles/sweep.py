@@ -86,7 +86,7 @@ def ensemble(
     t_eval : array_like of shape (m,), optional
         Times to report, or at which `reduce` is given states. The default is every step.
     reduce : str, Reduction, or callable, optional
-        What is kept of each orbit instead of its states: a name of `sympflow.ensembles.reductions.REDUCTIONS`, such as
+        The result of each orbit instead of its states: a name of `sympflow.ensembles.reductions.REDUCTIONS`, such as
         "final"; or a function of (t, y), the times (m,) and states (2d, m) of one orbit, that returns a number, an
         array, or a dict of such.
     workers : int, object with .map, or callable

@@ -102,7 +102,7 @@ class Certificate:
     relative_limit: float | None = None
 
     def bound(self, t: float) -> float:
-        """kδ, k = ⌈|t|/Δt⌉: an estimate of the most by which H changes over a time t while the orbit is in Ω."""
+        """kδ, k = ⌈|t|/Δt⌉: an estimate of the largest change of H over a time t while the orbit is in Ω."""
         return math.ceil(abs(t) / self.dt * (1 - 1e-12)) * self.delta.largest
 
     def to_dict(self) -> dict[str, Any]:

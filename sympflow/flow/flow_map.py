@@ -121,7 +121,7 @@ class FlowMap(KnownFlow, Shown, nn.Module):
 
     @classmethod
     def from_architecture(cls, ndof: int, plan: dict[str, Any], dt: float, dtype: torch.dtype) -> Self:
-        """Return an untrained flow of an architecture that a file describes, all of which is checked.
+        """Return an untrained flow of the architecture in a file, after a check of all its entries.
 
         Raises
         ------
@@ -159,7 +159,7 @@ class FlowMap(KnownFlow, Shown, nn.Module):
         return self.velocity(0.0, x, t0)
 
     def hamiltonian(self, t: float | Tensor, x: Tensor, t0: Any = None) -> Tensor:
-        """𝓗(ψ̄)(t, x), (...), for t ∈ [0, Δt]: the Hamiltonian of which ψ̄_t is the exact flow.
+        """𝓗(ψ̄)(t, x), (...), for t ∈ [0, Δt]: the Hamiltonian whose exact flow is ψ̄_t.
 
         The sum over the layers of ∂_tV at the point pulled back through the layers after it (Canizares et al. 2024,
         section 2.2), defined up to a function of t alone. That of a driven system is near H(t0 + t, x).
@@ -374,7 +374,7 @@ class FlowMap(KnownFlow, Shown, nn.Module):
         return HamiltonianSystem(hamiltonian=MeanHamiltonian(self), ndof=self.ndof, check=False, **scene)
 
     def take_learned(self, system: HamiltonianSystem | None = None) -> None:
-        """Bind the system that was learned with the flow: as it was found, or as the file tells that has the flow."""
+        """Bind the system that was learned with the flow: as it was found, or as in the file of the flow."""
         told = self.recipe.get("learned")
         if system is None and told is not None and told.get("own_hamiltonian"):
             system = self.mean_system(name="learned", domain=self.domain, dt=self.dt)
@@ -403,8 +403,8 @@ class FlowMap(KnownFlow, Shown, nn.Module):
         """An a-posteriori statement on this flow's energy error, kept as `certified` and stored by `save`.
 
         Over a seeded sample of Ω × [0, Δt] it estimates the defect, sup |𝓗 − H − c(t)|, and the δ with which
-        |H(ψ_kΔt(x)) − H(x)| ≤ kδ while the orbit is in Ω at every step; beside it stands the measured error of orbits
-        from held-out states. It is an estimate, not a proof: the suprema are the largest values in the sample.
+        |H(ψ_kΔt(x)) − H(x)| ≤ kδ while the orbit is in Ω at every step; it also measures the error of orbits from
+        held-out states. It is an estimate, not a proof: the suprema are the largest values in the sample.
 
         Parameters
         ----------
@@ -548,7 +548,7 @@ class FlowMap(KnownFlow, Shown, nn.Module):
         Parameters
         ----------
         system : HamiltonianSystem, optional
-            The system that it was trained for; by default the one that it knows. Without one there is no energy.
+            The system that it was trained for; by default the one that it holds. Without one there is no energy.
 
         Raises
         ------

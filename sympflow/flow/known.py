@@ -101,7 +101,7 @@ class KnownFlow:
 
     @property
     def kept_ndof(self) -> int:
-        """The degrees of freedom of the system by which the flow is recognised, as its file keeps it."""
+        """The degrees of freedom of the system that identifies the flow, as in its file."""
         return self.ndof
 
     def matches(self, system: HamiltonianSystem) -> bool:
@@ -115,7 +115,7 @@ class KnownFlow:
         return recognised(mine, self.identity, small)
 
     def check_ends(self, system: HamiltonianSystem) -> None:
-        """Refuse a lattice with ends of a kind at which the numbers of the flow do not hold."""
+        """Refuse a lattice with ends of a kind for which the flow is not accurate."""
 
     def check_system(self, system: HamiltonianSystem) -> None:
         """Raise ValueError if `system` is not the one this flow was trained for (a bare flow fits any)."""
@@ -180,7 +180,7 @@ class KnownFlow:
         return self
 
     def domain_for(self, system: HamiltonianSystem) -> Domain | None:
-        """Return Ω of the flow, or else of its system, ready to be asked for states; None if neither has one."""
+        """Return Ω of the flow, or else of its system, ready for sampling; None if neither has one."""
         domain = self.domain or system.domain
         if isinstance(domain, LatticeStates):
             return domain.of(system)
@@ -199,7 +199,7 @@ class KnownFlow:
         return None
 
     def warn_of_times(self, t: Any) -> None:
-        """Warn where a time, or one of several, is k·Δt + r with an r at which the flow was fitted to nothing."""
+        """Warn where a time, or one of several, is k·Δt + r with an r in an interval without labels."""
         if not self.unfitted:
             return
         seen = values(t)

@@ -161,7 +161,7 @@ class Register(Generic[T]):
         return announced(self.group, self.kind, self.built_in)
 
     def named(self, name: Any) -> T:
-        """The thing of that name; a ValueError says that there is none, an ImportError that a plug-in is broken."""
+        """The registered object of that name; a ValueError if there is none, an ImportError if a plug-in is broken."""
         if isinstance(name, str) and name in self.known:
             return self.known[name]
         if not isinstance(name, str) or name not in self.announced:
@@ -283,8 +283,8 @@ class Potential(nn.Module):
     4. `from_dict(ndof, plan, dtype)`, a class method, builds it again from that, untrained. The file is not to be
        trusted: it checks the plan before it allocates anything.
 
-    `impulse_and_rate` and `impulse_and_tangent` differentiate the first two by forward mode; a class that knows a
-    faster way replaces them.
+    `impulse_and_rate` and `impulse_and_tangent` differentiate the first two by forward mode; a class with a faster way
+    overrides them.
     """
 
     ndof: int

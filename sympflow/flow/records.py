@@ -1,4 +1,4 @@
-"""Records of flows in their files, each entry of which is checked before it is believed."""
+"""Records of flows in their files; each entry is checked before it is used."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ STAGE: dict[str, Any] = {
 
 
 class Refused(Exception):
-    """The reason for which a file is refused, and what to do."""
+    """The reason why a file is refused, and the remedy."""
 
     def __init__(self, reason: str, remedy: str = "Save it again with flow.save(path)") -> None:
         super().__init__(reason)

@@ -41,7 +41,7 @@ class ShippedFlow:
     dt : float
         Δt.
     stages : int or None
-        Number of kicks in a step of a primed flow, two of which in a row are one; None for a network.
+        Number of kicks in a step of a primed flow, two in a row counted as one; None for a network.
     processor : int
         Number of pairs of its processor.
     polynomial : int

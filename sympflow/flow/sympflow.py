@@ -655,7 +655,7 @@ class SystemFlow(SympFlow, ABC):
     @classmethod
     @abstractmethod
     def checked_plan(cls, plan: dict[str, Any], ndof: int) -> dict[str, Any]:
-        """Return the arguments of the class that a file describes, after a check of each; `Refused` says why not."""
+        """Return the arguments of the class that a file describes, after a check of each, which raises `Refused`."""
 
     def architecture(self) -> dict[str, Any]:
         return {"ndof": self.kept_ndof, self.PLAN: self.plan()}

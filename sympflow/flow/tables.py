@@ -124,7 +124,7 @@ class PrimedShape:
 
     @classmethod
     def from_dict(cls, plan: Any, ndof: int) -> Self:
-        """Return the shape that a file describes, all of which is checked."""
+        """Return the shape that a file describes, after a check of all its entries."""
         if not isinstance(plan, dict) or plan.get("first") not in ("kick", "drift"):
             raise Refused("its plan of a primed flow is missing")
         flags: dict[str, Any] = {name: plan.get(name) for name in ("palindromic", "force_gradient")}

@@ -67,7 +67,7 @@ class Definition:
 
     @property
     def name(self) -> str:
-        """The name of a system to which none was given."""
+        """The name of a system without a given name."""
         return ""
 
     def __getstate__(self) -> dict[str, Any]:

@@ -254,12 +254,12 @@ class EnergySublevel:
 
 
 def domain_of(domain: Domain, system: Hamiltonian) -> Domain:
-    """The domain of a system, ready to be asked for states: one that depends on H gets that of the system."""
+    """The domain of a system, ready for sampling: one that depends on H gets that of the system."""
     return domain.of(system) if isinstance(domain, EnergySublevel | LatticeStates) else domain
 
 
 def remedy_for(system: Hamiltonian) -> str:
-    """Domains that a system of which none is known may be given, as code."""
+    """Domains for a system without one, as code."""
     local = system.local
     own = ["LatticeStates(density)"] if local is not None and local.has_subsystem else []
     names = [*own, "Box(low, high)", "Ball(center, radius)", "EnergySublevel(energy, box)"]

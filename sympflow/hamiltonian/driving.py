@@ -1,7 +1,7 @@
 """Driven systems, H(t, q, p): samples of a function of t in expressions, and drifts of T(p, t).
 
 The flow of H(t, q, p) is that of the autonomous E + H(t, q, p) in [q, t, p, E], with t' = 1 and E' = −∂H/∂t. A
-splitting cuts it into T(p, t) + E, a drift with which the time moves, and V(q, t), a kick at a time that stands still.
+splitting cuts it into T(p, t) + E, a drift, with which the time moves, and V(q, t), a kick at a fixed time.
 """
 
 from __future__ import annotations

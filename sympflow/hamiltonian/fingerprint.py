@@ -63,7 +63,7 @@ def _close(u: np.ndarray, v: np.ndarray) -> bool:
 
 
 def check_for_flows(system: Hamiltonian, takes_friction: bool = False, takes_driving: bool = False) -> None:
-    """Refuse a system of which a flow would leave something out: friction, an external force, or the time."""
+    """Refuse a system with terms that a flow cannot have: friction, an external force, or the time."""
     if system.external_force is not None or not takes_friction:
         system.check_conservative(
             "which only primed flows can have, with H = ½ pᵀM⁻¹p + V(q)",

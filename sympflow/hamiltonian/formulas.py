@@ -1,7 +1,8 @@
 """Formulas: functions of variables that programs are recorded of, of an H by symbols or by Python functions.
 
-A form says what H is made of. That of symbols is `SymbolicHamiltonian`, whose expressions are SymPy's; that of Python
-functions is `TracedHamiltonian`, whose expressions are programs. Kernels take either, and no more than they share.
+A form describes the structure of H. That of symbols is `SymbolicHamiltonian`, whose expressions are SymPy's; that of
+Python functions is `TracedHamiltonian`, whose expressions are programs. Kernels take either, and no more than they
+share.
 """
 
 from __future__ import annotations

@@ -107,7 +107,7 @@ class Hamiltonian:
 
     @property
     def symbols(self) -> Any:
-        """The symbolic definition, made when it is first asked for, of H as text or SymPy's; else None."""
+        """The symbolic definition of H as text or SymPy's, made at first use; else None."""
         return self.definition.symbols
 
     @property
@@ -526,7 +526,7 @@ class Hamiltonian:
 
     @property
     def untraced(self) -> str:
-        """The reason for which Python functions could not be traced, a clause; "" if they were, or there are none."""
+        """The reason why Python functions could not be traced, a clause; "" if they were, or there are none."""
         if self.followed_mass is not None:
             return "`mass` requires gradients, which flow by tensor operations"
         return "" if self.form is not None else self.definition.untraced
@@ -550,7 +550,7 @@ class Hamiltonian:
 
     @property
     def written(self) -> Any:
-        """The symbolic definition, or that of a few bodies or a traced function, written when asked for; else None."""
+        """The symbolic definition, or that of a few bodies or a traced function, made at first use; else None."""
         if self.local is not None:
             return self.local.written
         form = self.form
@@ -612,7 +612,7 @@ def length_of_change(system: Hamiltonian, q: Array, along: Array, other: Array, 
 
 
 def step(q: Array, length: Array) -> Array:
-    """The h for which the truncation of `derivative`, (h/ℓ)⁴, and the rounding, ε max(|q|, ℓ)/h, are even."""
+    """The h for which the truncation error of `derivative`, (h/ℓ)⁴, equals the rounding error, ε max(|q|, ℓ)/h."""
     eps, xp = library(q).finfo(q.dtype).eps, library(q)
     return length * (eps * xp.maximum(largest(q) / length, 0 * length + 1)) ** 0.2
 

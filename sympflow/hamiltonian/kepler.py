@@ -288,7 +288,7 @@ def elements_of(x: np.ndarray, v: np.ndarray, mu: Any) -> np.ndarray:
 
 @np.errstate(all="ignore")
 def states_of(elements: np.ndarray, mu: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Positions and velocities (..., 3) of elements (..., 6): the pericentre, moved by the time that M tells."""
+    """Positions and velocities (..., 3) of elements (..., 6): the pericentre, moved by the time that belongs to M."""
     a, e, inclination, node, peri, M = np.moveaxis(np.asarray(elements, dtype=float), -1, 0)
     mu = np.asarray(mu, dtype=float) + 0 * a
     q = a * (1 - e)

@@ -41,7 +41,7 @@ class LayeredPotential:
 
     @cached_property
     def starts(self) -> list[tuple[int, int | None]]:
-        """Places among all numbers at which the weights of each layer begin, and its biases."""
+        """Indices among all numbers at which the weights and the biases of each layer begin."""
         found, n = [], 0
         for (come, go), (_, bias) in zip(self.sizes, self._chain.layers, strict=True):
             found.append((n, None if bias is None else n + come * go))

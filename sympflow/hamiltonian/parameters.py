@@ -102,7 +102,7 @@ class Samples:
 
     @cached_property
     def digest(self) -> str:
-        """A name of the content, by which H of other samples is another expression."""
+        """A name made from the content, so that H with other samples is another expression."""
         content = b"".join((self.c.tobytes(), self.x.tobytes(), bytes([self.periodic])))
         return hashlib.sha256(content).hexdigest()[:12]
 

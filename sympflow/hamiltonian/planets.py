@@ -1,4 +1,5 @@
-"""Planets about a star: a system that knows its star, and the coordinates in which Kepler's motion is cut.
+"""Planets about a star: a system with a star, and the coordinates of the splitting into Kepler's motion and
+interaction.
 
 A frame has the planets in their order from the star, positions x and velocities v of each relative to a centre, about
 which its motion is Kepler's with μ, and the rest of H, the interaction: a potential in Jacobi's coordinates.

@@ -121,7 +121,7 @@ def _takes_order(f: sp.Basic) -> bool:
 
 
 def check_recorded(f: sp.Expr) -> None:
-    """Raise a ValueError with the term of an expression of which `calculated` has no rule for a function."""
+    """Raise a ValueError with the term of an expression that has a function without a rule in `calculated`."""
     for term in sp.Add.make_args(f):
         if not can_be_recorded(term):
             raise arrays_only(f"`system` has the term {term}, and there is no compiled function for it")

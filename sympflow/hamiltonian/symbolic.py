@@ -283,7 +283,7 @@ class SymbolicHamiltonian(Definition):
 
     @property
     def structure(self) -> SymbolicHamiltonian:
-        """H with the values with which it was first given: whatever does not depend on these is found from it."""
+        """H with the values with which it was first given: the source of all that does not depend on these values."""
         return self
 
     @property
@@ -520,7 +520,7 @@ class SymbolicHamiltonian(Definition):
 class Revalued(SymbolicHamiltonian):
     """H with other values of parameters: they are numbers of functions that are generated once for all of them.
 
-    H, V and T with these values are made when they are first asked for, as few runs do.
+    H, V and T with these values are made at first use, because few runs need them.
     """
 
     def __init__(

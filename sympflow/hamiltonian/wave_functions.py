@@ -158,7 +158,7 @@ class WaveFunctionHamiltonian(LocalHamiltonian):
 
 
 class PhaseTurn:
-    """Σ f(ρ) as a part of H, of which the flow is known: see `sympflow.hamiltonian.parts`."""
+    """Σ f(ρ) as a part of H with a known flow: see `sympflow.hamiltonian.parts`."""
 
     of_positions, turns, timed = False, True, False
 

@@ -26,7 +26,7 @@ from sympflow.kernels.protocol import RunCheckpoint
 class FixedStep(Integrator):
     """An integrator on the grid t0 + k·dt.
 
-    Between grid points, at the times that `t_eval` or the dense output ask for, and at the end of an interval that dt
+    Between grid points, at the times of `t_eval` or the dense output, and at the end of an interval that dt
     does not divide, the state is a shorter step from the last grid point: ψ_t = ψ_{t−k·dt} ∘ (ψ_dt)^k.
 
     Parameters

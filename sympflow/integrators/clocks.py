@@ -2,7 +2,7 @@
 
 On the physical clock the steps are those of the grid t0 + k·dt. On the logarithmic one they are equal in the time s of
 the logarithmic Hamiltonian; t is a coordinate of the transformed system, whose value at the end of a step is what the
-method makes it. A state at a time that is asked for is a shorter step from the last state before it, of the length σ
+method makes it. A state at a given time is a shorter step from the last state before it, of the length σ
 that solves t(σ) = t, to rounding.
 """
 

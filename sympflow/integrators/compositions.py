@@ -82,7 +82,7 @@ class Composition(ABC, ArraySteps):
         """Raise a ValueError where the friction or the drive of the system needs shorter steps, or has no flow."""
 
     def longest_step(self) -> float:
-        """The longest step with which the method is to be used."""
+        """The longest step that is recommended for the method."""
         return math.inf
 
     def doubt(self, dt: float) -> str:

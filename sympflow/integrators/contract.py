@@ -4,24 +4,24 @@ An integrator is a frozen dataclass whose fields are its options (`dt`, `rtol`, 
 Its duties:
 
 1. `step(system, t, y, h)` maps states y (..., 2d) over a step h, negative or not, of shape () or y.shape[:-1]; so is t.
-2. `order` (None if trained), `symplectic`, `trained` and `source` are class attributes that tell the truth.
+2. `order` (None if trained), `symplectic`, `trained` and `source` are class attributes, and correct.
 3. `check(system)` raises a ValueError with the reason where the method does not apply.
-4. `run(problem)` produces the states that were asked for, and no others, as an `Outcome`.
+4. `run(problem)` produces the requested states, and no others, as an `Outcome`.
 5. `steps(system, t_span, y0)` executes the same run again as a stream of the steps that it takes, and
 6. `tangent(system, t, y, h)` differentiates such a step, so that metrics judge the map that was really executed; where
    that acts on more than y, `jacobian` and `executed` differentiate it where it acts.
 7. `inverse(system, t, y, h)` undoes `step(system, t, y, h)` exactly, or raises a TypeError.
 8. `finds_events` is False, and `solve` seeks events on the dense output afterwards; or `run` hands every step to
-   `problem.events`, if there are any, and ends where that says.
+   `problem.events`, if there are any, and ends where that requires.
 
-9. `arrays_only` says so, where `step` and `run` take NumPy arrays only.
-10. `takes_friction` is False, and a damped system is refused before the integrator sees it; or the method takes the
+9. `arrays_only` is set, if `step` and `run` take NumPy arrays only.
+10. `takes_friction` is False, and a damped system is refused; or the method takes the
    friction −Γp into account, as one that steps by `system.vector_field` does. `takes_forces` says the same of a force
    that does not come from H and that only `vector_field` has.
-11. `takes_driving` is False, and a driven system, H(t, q, p), is refused before the integrator sees it; or the method
+11. `takes_driving` is False, and a driven system, H(t, q, p), is refused; or the method
    takes H and its derivatives at the times of its stages, t + c·h, as `system.vector_field(y, t + c * h)` does. Where
-   c is 0 or 1, `forces_at_ends(system)` says so, and a run is cut at the jumps of H; where c lies outside of these,
-   `forces_beyond(system)` says so, and the jumps are warned of.
+   c is 0 or 1, `forces_at_ends(system)` is True, and a run is cut at the jumps of H; where c lies outside [0, 1],
+   `forces_beyond(system)` is True, and jumps cause a warning.
 
 `FixedStep`, in `sympflow.integrators.base`, does 4, 5, 6 and 8 for any integrator that has a step: a new one needs
 duties 1 to 3 only, and its forces are counted. Whatever a run changes, such as its kernel and its counts, belongs to a
@@ -73,7 +73,7 @@ def interrupted(outcome: Outcome, t: float) -> Interrupted:
 
 
 def finished(problem: Problem) -> str:
-    """Return the message of a run that went as far as the last time that was asked for, which may be before the end."""
+    """Return the message of a run up to the last output time, which may be before the end."""
     times = problem.t_eval
     if times is None or problem.dense_output or problem.events is not None:
         return FINISHED
@@ -89,7 +89,7 @@ def finished(problem: Problem) -> str:
 
 
 class Failure(Enum):
-    """The reasons for which a run of steps cannot go on. Each is its message: what happened, and the remedy."""
+    """The reasons why a run of steps cannot go on. Each is its message: what happened, and the remedy."""
 
     NON_FINITE = "The solution became non-finite", "Reduce `dt`"
     UNSOLVED = "The implicit step could not be solved: Newton's iteration did not converge", "Reduce `dt`"
@@ -255,7 +255,7 @@ class Integrator:
     def resolved(self, system: HamiltonianSystem, y0: Array, length: float, n_times: int = 0) -> Integrator:
         """Return the integrator that runs from y0 over a time `length`, where the method leaves a choice.
 
-        `n_times` is the number of given times at which states are asked for.
+        `n_times` is the number of given output times.
         """
         return self
 
@@ -313,7 +313,7 @@ class Integrator:
         return forward_tangent(lambda x, lengths: self.step(system, times, x, lengths), y, h)
 
     def tangent_kernel(self, system: HamiltonianSystem, vectors: int) -> TangentKernel:
-        """The compiled loops of steps with so many deviation vectors; a ValueError says why there are none."""
+        """The compiled loops of steps with this number of deviation vectors; a ValueError says why there are none."""
         raise NotCompiled(f"`method` {self.name!r} has no compiled deviation vectors: use backend='auto'.")
 
     def jacobian(self, system: HamiltonianSystem, t: float, y: Array, h: Array) -> np.ndarray:

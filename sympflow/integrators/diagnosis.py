@@ -1,5 +1,7 @@
-"""After a run: the poles of H and the collisions that it leapt over, steps that are too long, and the time at which the
-solution of a run that failed becomes infinite."""
+"""Checks after a run: poles of H and collisions within a step, and steps that are too long.
+
+For a failed run also the time at which the solution becomes infinite.
+"""
 
 from __future__ import annotations
 
@@ -124,7 +126,7 @@ class Passage(NamedTuple):
 def note_poles(
     outcome: Outcome, integrator: Integrator, problem: Problem, values: ParameterRows | None
 ) -> list[Passage]:
-    """End a run where it passed a place at which H is infinite or no number; warn where it may have."""
+    """End a run where it passed a place at which H is infinite or NaN; warn where it may have passed one."""
     poles, width, n = problem.system.definition.poles, 2 * problem.system.ndof, len(outcome.t)
     numbers: Sequence[Any] = ()
     if problem.parameter_values is not None:
@@ -327,7 +329,7 @@ def _end(
 
 
 def warn_of_long_steps(outcome: Outcome, integrator: Integrator, problem: Problem) -> None:
-    """Warn of what a method doubts, and of steps with which the energy is off by more than 1 % of its size.
+    """Warn of the doubts of a method, and of steps with which the energy is off by more than 1 % of its size.
 
     Where energy is not kept, the motion at the start and the end must not be too fast for the step. On a clock the
     energy may be kept although the time is wrong: a run of few steps is compared with one in halves.

@@ -58,7 +58,7 @@ def known(key: tuple[Any, ...], make: Callable[[], T]) -> T:
 
 @kept
 def kind_of(system: HamiltonianSystem) -> tuple[Any, ...]:
-    """The formula and the flows that systems share for which the same flows are kept."""
+    """The formula, and flows that are kept together for all systems with it."""
     return system.fingerprint, system.definition.text, tuple(f.name for f in shipped_flows(system))
 
 
@@ -268,7 +268,7 @@ class SympFlowIntegrator(FlowIntegrator):
     tol : float, optional
         Take the cheapest shipped flow whose relative energy error up to T = 1000, the 95 % quantile over held-out
         states, is at most this; `sympflow.shipped_flows(system)` lists them, and a T that differs. Where y0 is outside
-        the domain of that flow there is no such figure, and a ValueError says so. It says nothing of a smaller `dt`.
+        the domain of that flow there is no such figure, which is a ValueError. It does not hold for a smaller `dt`.
     compensated : bool
         True to sum with Kahan's compensation, which slows the growth of round-off. Compiled primed flows only.
 

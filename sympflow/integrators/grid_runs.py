@@ -1,7 +1,7 @@
 """Runs of steps, by one driver: outputs in memory, with events, or into a store, on the grid t0 + k·dt.
 
 A long run is made in windows of a fraction of a second, which give the same bits as the run in one piece. Between two
-of them progress is told, outputs are stored, and Ctrl-C finds what was computed so far.
+of them progress is reported, outputs are stored, and Ctrl-C can end the run.
 """
 
 from __future__ import annotations
@@ -210,7 +210,7 @@ def broken_off(
 
 
 def report_lanes(outcome: Outcome, ok: np.ndarray, breakdown: Failure) -> None:
-    """Flag a run under `torch.func.vmap` of which some lane failed: `ok` (n, ...) is False where one is not finite."""
+    """Flag a run under `torch.func.vmap` in which a lane failed: `ok` (n, ...) is False where one is not finite."""
     what, remedy = breakdown.value
     bad = ~ok.all(0)
     outcome.status = np.where(bad, -1, 0) if bad.ndim else -1

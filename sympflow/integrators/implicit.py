@@ -29,15 +29,15 @@ _SYMPLECTIC = (
 class Gauss(FixedStep):
     """A Gauss method: K_i = h f(y + Σ_j a_ij K_j), y + Σ_i b_i K_i, solved by Newton's method with the Hessian of H.
 
-    The coefficients satisfy b_i a_ij + b_j a_ji = b_i b_j without rounding, for which from three stages on the unknowns
-    are b_i K_i [3]_: rounded coefficients would make the energy drift, a part in 1e16 with each step.
+    The coefficients satisfy b_i a_ij + b_j a_ji = b_i b_j without rounding; for that the unknowns are, from three
+    stages on, b_i K_i [3]_: rounded coefficients would make the energy drift, a part in 1e16 with each step.
 
     The iteration runs until the increments are rounding, so that a step is symplectic and reversible to rounding; an
     iteration that stops at a tolerance would make the energy drift [2]_. A step that has no solution, or whose
     iteration does not find it, ends the solution with status −1.
 
     With friction −Γp a step is one in q and P = e^{Γτ}p, τ from its beginning: P' = −e^{Γτ}∂H/∂q has no friction, and
-    for Γ = γ these are the equations of e^{γτ}H(q, e^{−γτ}P), of which a Gauss method is symplectic. So the step is
+    for Γ = γ these are the equations of e^{γτ}H(q, e^{−γτ}P), for which a Gauss method is symplectic. So the step is
     conformally symplectic, of the same order, for any H.
 
     Parameters

@@ -1,4 +1,4 @@
-"""Checks of an initial value problem and of the outputs that are asked for: a message names the argument."""
+"""Checks of an initial value problem and of its outputs: a message names the argument."""
 
 from __future__ import annotations
 

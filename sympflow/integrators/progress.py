@@ -1,4 +1,4 @@
-"""Progress: how much of a long call is done, told to a function of the user or drawn as a bar on stderr."""
+"""Progress: how much of a long call is done, reported to a function of the user or drawn as a bar on stderr."""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ class Projected(FixedStep):
 
     @property
     def inner(self) -> Integrator:
-        """The method of which each step is projected."""
+        """The method whose steps are projected."""
         return self.of
 
     @property

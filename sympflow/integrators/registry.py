@@ -294,7 +294,7 @@ class naming_plugin:
 
 
 def check_applies(integrator: Integrator, system: HamiltonianSystem, y0: Array | None = None) -> None:
-    """`integrator.check(system)`: a ValueError says that the method does not apply; a plug-in that fails is named.
+    """`integrator.check(system)`: a ValueError if the method does not apply; a plug-in that fails is named.
 
     The functions of a user's system are tested too, for states such as y0. Friction, forces that do not come from H,
     and an H that depends on t are refused here for every method that does not declare that it takes them.

@@ -51,7 +51,7 @@ class ArraySteps:
         return rollout(lambda k, y: self.step(y, h, t0 + k * h), y0, n_steps, save, carry=carry)
 
     def check_lengths(self, h: Any) -> None:
-        """Warn of lengths of steps, those of compiled loops too, for which the method was not made."""
+        """Warn of lengths of steps, including those of compiled loops, that are not recommended for the method."""
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
         """Evaluations of forces and their derivatives, as `FixedStep.evaluations`."""

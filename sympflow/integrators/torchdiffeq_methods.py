@@ -165,7 +165,7 @@ class _EndedError(Exception):
 
 
 class TooManyStepsError(Exception):
-    """Raised by `integrate` where a bound on the number of steps is met: the message says so, and the remedy."""
+    """Raised by `integrate` at a limit of the number of steps; the message names the remedy."""
 
 
 class Watched(ByVectorField):
@@ -191,7 +191,7 @@ class Watched(ByVectorField):
         visit: Visit,
         most_steps: int | None = None,
     ) -> tuple[Trace, str | None]:
-        """Run, handing over every step until `visit` says so; and why it failed, if it did."""
+        """Run and pass every step to `visit` until it returns True; return the reason of a failure, if any."""
         import torch
 
         trace, failure = self.trace(self, system, t_span, y0, visit), None

@@ -48,7 +48,7 @@ class Comparison:
     remedy : str
         The way to pass the same system twice.
     given : callable
-        The right-hand side; a system is compared by its fingerprint at once, and a ValueError says that it is another.
+        The right-hand side; a system is compared by its fingerprint at once, and another one is a ValueError.
 
     Attributes
     ----------
@@ -77,7 +77,7 @@ class Comparison:
             )
 
     def with_flow(self, y: np.ndarray, t: float) -> None:
-        """Compare the velocity of a flow that knows no system with that of the system it shall solve.
+        """Compare the velocity of a flow without a system with that of the system to be solved.
 
         Raises
         ------

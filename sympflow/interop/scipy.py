@@ -39,16 +39,16 @@ def as_scipy(method: Any, system: HamiltonianSystem | None = None, **options: An
     method : trained flow, str or Integrator
         A flow, a name such as "verlet" or "sympflow" (the shipped flow), or a configured integrator.
     system : HamiltonianSystem, optional
-        What is solved. A flow knows its own; otherwise it may only be left out if `fun` is a HamiltonianSystem.
+        What is solved. A flow has its own; otherwise it may only be left out if `fun` is a HamiltonianSystem.
     **options
         Options of the method, such as `dt`.
 
     Raises
     ------
     TypeError, ValueError
-        If the method does not apply to the system, is adaptive, or has no such option. Within `solve_ivp` a ValueError
-        says that `fun` is another system than the one that the method solves, or depends on the time, as far as several
-        states and times tell, before the run and along it.
+        If the method does not apply to the system, is adaptive, or has no such option. Within `solve_ivp` it is a
+        ValueError if `fun` is another system than that of the method, or depends on the time: this is tested at several
+        states and times, before the run and along it.
 
     Examples
     --------

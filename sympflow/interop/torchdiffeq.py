@@ -78,8 +78,8 @@ def odeint(
     Raises
     ------
     ValueError
-        If `func` is another system than the one that our method solves, or depends on the time, as far as several
-        states and times tell, at the start and along the run.
+        If `func` is another system than that of our method, or depends on the time: this is tested at several states
+        and times, at the start and along the run.
     """
     if not _is_ours(method, func, options):
         asked = {"rtol": rtol, "atol": atol, "method": method, "options": options, "event_fn": event_fn}

@@ -41,8 +41,8 @@ def register(name: str, system: HamiltonianSystem, method: Any = None, **options
     name : str
         What `torchode.solve_ivp(method=name)` will say; also the method, if that is not given.
     system : HamiltonianSystem
-        What is solved. torchode's term, where it is not this system, is evaluated at several states and times of a run:
-        a ValueError says that it is another one.
+        The system that is solved. torchode's term, if it is not this system, is compared with it at several states and
+        times of a run; another one is a ValueError.
     method : str, trained flow or Integrator, optional
     **options
         Options of the method. The step length is torchode's `dt0`, so `dt` is not one of them.

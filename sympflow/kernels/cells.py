@@ -18,7 +18,7 @@ SHAPE, STARTS = 0, 4
 
 
 def most_along(n: int, dim: int) -> int:
-    """The number of cells along an axis from which more do not pay."""
+    """The number of cells along an axis beyond which more do not reduce the time."""
     return int(2.0 * n ** (1.0 / dim)) + 1
 
 

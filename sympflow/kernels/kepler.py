@@ -546,7 +546,7 @@ class KeplerLoops:
             self._found[n + group] = LANES * (groups + g) + lanes[: len(group)]
 
     def code(self, form: Form) -> KeplerCode:
-        """The compiled functions of a form, made once; NotCompiled says why there are none."""
+        """The compiled functions of a form, made once; raises NotCompiled if there are none."""
         if self._light and form.gradients:
             raise NotCompiled(
                 "`system` has bodies without mass, and compiled force gradients are for bodies with mass: use "

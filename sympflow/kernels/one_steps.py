@@ -198,7 +198,7 @@ class OneStepKernel(Kernel):
         self._code.check_reverse()
 
     def recorded(self, task: Task) -> Recorded:
-        """`runs`, as a run of which cotangents can be pulled back: after `check_reverse`."""
+        """`runs`, as a run whose cotangents can be pulled back: after `check_reverse`."""
         from sympflow.kernels.reverse import Recorded
 
         y0 = task.y0 if self._own is None else np.concatenate([task.y0, self._own], axis=1)

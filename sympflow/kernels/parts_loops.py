@@ -261,7 +261,7 @@ class PartsCode(Rollouts):
 
 @kept
 def parts_loops(parts: ExactParts) -> PartsLoops:
-    """The compiled loops of the parts of a system, made once; NotCompiled says why there are none."""
+    """The compiled loops of the parts of a system, made once; raises NotCompiled if there are none."""
     return PartsLoops(parts)
 
 

@@ -39,7 +39,7 @@ class RunCheckpoint:
 
 
 class Task(NamedTuple):
-    """A run that is asked for, of states `y0` (N, 2d): see `Kernel.run`."""
+    """The request for a run of states `y0` (N, 2d): see `Kernel.run`."""
 
     h: float
     y0: np.ndarray
@@ -180,7 +180,7 @@ def both_ways(step: Callable[[Any, bool], np.ndarray], h: np.ndarray, y: np.ndar
 
 
 class Kernel(ABC):
-    """Compiled loops of a method on one system; states are [q, p], float64. A subclass says `runs` and `step`.
+    """Compiled loops of a method on one system; states are [q, p], float64. A subclass defines `runs` and `step`.
 
     `saves_finite` is true if all states that are saved up to the last finite step are finite; `backend` a name for
     `stats`, `tensors` weights in H that torch follows, `remark` a sentence on the end of a run that could not go on.
@@ -227,7 +227,7 @@ class Kernel(ABC):
         raise NotCompiled("`y0` requires gradients, and the loops of the method have no reverse: use backend='array'.")
 
     def recorded(self, task: Task) -> Any:
-        """`runs`, as a run of which cotangents can be pulled back, after `check_reverse`: see `reverse.Recorded`."""
+        """`runs`, as a run whose cotangents can be pulled back, after `check_reverse`: see `reverse.Recorded`."""
         raise NotImplementedError
 
     @property

@@ -79,7 +79,7 @@ def shared(key: Any, make: Callable[[], Any]) -> Any:
 
 
 class Rollouts(ABC):
-    """The compiled functions of one stage. A method says what its stage is, and how its tables become columns.
+    """The compiled functions of one stage. A method defines its stage, and how its tables become columns.
 
     Attributes
     ----------

@@ -1,9 +1,9 @@
 """Compiled runs over traced numbers: n steps of stages, their outputs, the first that is not finite; for every method.
 
-A method says what a stage is: a function of the values of a state and of the numbers of one column of a table. A run
+A method defines a stage: a function of the values of a state and of the numbers of one column of a table. A run
 executes columns [opening, inner …, link, closing]: the first step begins with the opening, each other one with the
-link, which is the end of a step and the beginning of the next in one. An output is a copy of the state to which the
-closing column is applied. One function is the run of a single trajectory, and of several in the lanes of registers.
+link, which is the end of a step and the beginning of the next in one. An output is a copy of the state after the
+closing column. One function is the run of a single trajectory, and of several in the lanes of registers.
 """
 
 from __future__ import annotations

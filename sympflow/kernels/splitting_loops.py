@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 @kept
 def splitting_loops(system: HamiltonianSystem, names: tuple[str, ...] = ()) -> SplittingLoops:
-    """The compiled loops on a separable system, whose `values` may be those of `names`; NotCompiled says why not."""
+    """The compiled loops on a separable system, whose `values` may be those of `names`; or NotCompiled."""
     return SplittingLoops(system, names)
 
 
@@ -364,7 +364,7 @@ class SplittingKernel(Kernel):
         self._code.check_reverse()
 
     def recorded(self, task: Task) -> Recorded:
-        """`runs`, as a run of which cotangents can be pulled back: after `check_reverse`."""
+        """`runs`, as a run whose cotangents can be pulled back: after `check_reverse`."""
         from sympflow.kernels.reverse import Recorded
 
         table, rows = self.table(task.h, task.t0), self._rows(task)

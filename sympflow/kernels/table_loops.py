@@ -43,7 +43,7 @@ BLOCKS = 2048  # of lanes, some milliseconds, between two looks at the clock
 class TableLoops:
     """The compiled errors of labels for a system with T = ½ pᵀM⁻¹p, a sequence of `kicks` (True) and drifts.
 
-    `drifts` tells where their numbers stand among those of all stages. NotCompiled says why there are none.
+    `drifts` are the indices of their numbers among those of all stages. Raises NotCompiled if there are none.
     """
 
     def __init__(

@@ -231,7 +231,7 @@ class TangentKernel:
         found = TangentRun(growth, spreads, np.full(N, n_steps), np.ones(N, dtype=bool))
 
         def follow(looks: np.ndarray, rows: np.ndarray, carry: RunCheckpoint) -> np.ndarray:
-            """Follow orbits to the last of some looks, into the rows of `found`, and tell which have ended (n,)."""
+            """Follow orbits to the last of some looks, into the rows of `found`, and return which have ended (n,)."""
             task = Task(0.0, start[rows], int(looks[-1]), looks, carry, threads=threads)
             run = run_states(rollout, task, self._code.n_values, work)
             with np.errstate(all="ignore"):
@@ -279,7 +279,7 @@ def _looks(save: np.ndarray, n_steps: int, limit: float) -> np.ndarray:
 
 @kept
 def tangent_code(system: HamiltonianSystem, level: int, monomials: Monomials, vectors: int, grows: bool) -> TangentCode:
-    """The compiled functions of a system with k vectors, made once; NotCompiled says why there are none."""
+    """The compiled functions of a system with k vectors, made once; raises NotCompiled if there are none."""
     lacks = _lacks(system)
     if lacks:
         raise NotCompiled(lacks)

@@ -47,8 +47,8 @@ def at_most(threads: int) -> Iterator[None]:
 def run_one(call: Callable[[np.ndarray], T], work: float) -> T:
     """``call(stop)``, whose work takes about so many nanoseconds or more; it must end soon once ``stop[0]`` is set.
 
-    Compiled code in the main thread holds Ctrl-C off until it returns. So what takes long runs in another thread, and
-    this one waits.
+    Compiled code in the main thread holds Ctrl-C off until it returns. So long calls run in another thread, while this
+    one waits.
     """
     if work < LONG:
         return call(NEVER)

@@ -341,7 +341,8 @@ def _columns(X: np.ndarray, scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 
 def drive_frequency(X: np.ndarray, smooth: Smooth, scales: np.ndarray, drive: Drive) -> float:
-    """The angular frequency at which a drive explains most of what the fields X (n, 2d, K) leave of slopes.
+    """The angular frequency of the drive that explains most of the residuals of the slopes after the fields X (n, 2d,
+    K).
 
     The peaks of the periodograms with each of its terms are compared by a fit of all, and the best is refined.
     """

@@ -1,9 +1,9 @@
 """`discover`: the Hamiltonian behind trajectories, or behind a trained flow, as a sparse sum of terms.
 
 A first model is a regression of smoothed derivatives. From there terms are added and dropped one at a time. Each model
-on the way is refined by shooting from latent initial states (`shooting`), so that the noise of the states biases
-no coefficient; the linearized problem tells at once what each term that is missing would gain. The extended
-Bayesian criterion decides, which counts how many terms there were to choose from.
+on the way is refined by shooting from latent initial states (`shooting`), so that the noise of the states does not bias
+the coefficients; the linearized problem gives the gain by each missing term at once. The extended Bayesian criterion
+decides, which counts how many terms there were to choose from.
 """
 
 from __future__ import annotations
@@ -184,7 +184,7 @@ class Discovery:
     noise : ndarray of shape (2d,)
         The noise of each coordinate: the root mean square of what the model leaves. Of a flow (1,), in units of H.
     expected_noise : ndarray of shape (2d,)
-        The noise as it was given, or seen in the data without a model; 0 where they cannot tell.
+        The noise as it was given, or seen in the data without a model; 0 where this is not possible.
     explains : bool
         False if the model leaves more than noise, or the data do not distinguish it from others: see `unseen`.
     remark : str

@@ -66,7 +66,7 @@ class Constraints:
         return bool(np.isfinite(self.periods).any())
 
     def groups(self, name: str) -> Iterator[Group]:
-        """The models of a family, and the same where q would be angles that nobody told of."""
+        """The models of a family, and the same with q as angles, if no `period` was given."""
         family, d = FAMILIES[name], self.ndof
         yield Group(family, [*family.models(self)])
         for said, period in () if self.angles_known or not family.angular else ASSUMED.items():
@@ -76,7 +76,7 @@ class Constraints:
                 yield Group(family, [*models], assumed=True)
 
     def at_rest(self, bodies: np.ndarray) -> bool:
-        """True unless the total momentum of bodies (n, dim) is seen to change, as it cannot by forces between them."""
+        """True unless the total momentum of bodies (n, dim) changes, which forces between them cannot cause."""
         if self.momenta is None or self.known:
             return True
         total = sum(self.momenta[np.ix_(axis, axis)].sum() for axis in bodies.T)
@@ -291,7 +291,7 @@ neural potentials, which are fitted to the data themselves, and no H is learned.
 
 
 def families(constraints: Constraints, name: str | None) -> list[str]:
-    """The names of the families that fit what is known, or of the one that is asked for.
+    """The names of the families that are consistent with the options, or of the one that is chosen.
 
     Raises
     ------
@@ -344,7 +344,7 @@ def with_unit_mass(candidate: Candidate, constraints: Constraints) -> Candidate 
 
 
 def pruned(candidate: Candidate, theta: np.ndarray, precision: np.ndarray, values: int) -> Candidate | None:
-    """The same model without the terms of sums that the data do not ask for; None if they ask for all.
+    """The same model without terms that are not significant; None if all are.
 
     Terms are left out one by one, that one first which, by the quadratic approximation of χ² at its minimum, raises it
     least, as long as Schwarz's criterion gains: by less than the logarithm of the number of values.

@@ -44,7 +44,7 @@ FEWEST_PAIRS = 30  # of residuals that count as independent, to tell such noise 
 
 
 def limit_of(loss: str) -> float | None:
-    """The size of residuals, in σ, from which a loss is no square; None if there is none."""
+    """The size of residuals, in σ, above which the loss is not quadratic; None if there is none."""
     if loss not in LOSSES:
         raise ValueError(f"`loss` must be one of {', '.join(LOSSES)}; got {loss!r}.")
     return LOSSES[loss]
@@ -207,7 +207,7 @@ def kept(found: Fitted) -> dict[str, Any]:
 
 
 def restored(model: Field, data: Trajectories, numbers: dict[str, Any], setting: Setting) -> Fitted:
-    """The fit with these numbers, at which nothing is minimized again."""
+    """The fit with these numbers, without another minimization."""
     method = Method(steppers(model)[numbers["stepper"]], numbers["longest"])
     theta, sigma, of, states = (np.asarray(numbers[name]) for name in ("theta", "sigma", "of", "states"))
     span = float(numbers["span"])
@@ -283,7 +283,7 @@ class Held:
 
     @property
     def explained(self) -> bool:
-        """True if nothing but noise is left: residuals are exact, or as loud and one tells nothing of the next."""
+        """True if the residuals are noise: at the level of rounding, or of the size of the noise and uncorrelated."""
         silent = abs(self.correlation) < CORRELATED + 3 / math.sqrt(max(self.pairs, 1))
         return self.exact or (silent and self.loudness < LOUDER and self.excess < LOUDER)
 

@@ -186,7 +186,7 @@ def _derivatives(terms: tuple[sp.Expr, ...], symbols: Coordinates, order: int) -
 
 
 def library_for(terms: Any, ndof: int, degree: int, states: np.ndarray) -> tuple[Library, tuple[sp.Expr, ...]]:
-    """The library that was asked for, and the terms of it that others make superfluous."""
+    """The given library, and those of its terms that are linear combinations of others."""
     given = LIBRARIES if terms is None else [terms] if isinstance(terms, str | sp.Expr) else terms
     if not isinstance(given, Iterable):
         raise TypeError(f"`terms` must be expressions and names of {', '.join(LIBRARIES)}; got {given!r}.")

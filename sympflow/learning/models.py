@@ -25,7 +25,7 @@ class VectorField:
     velocities: bool = False  # True if [q, q'] are observed
 
     def at(self, t: np.ndarray) -> Any:
-        """The field at times t (N,), one for each of the states that it is asked for."""
+        """The field at times t (N,), one for each state."""
         return self
 
     def observed(self, theta: np.ndarray, x: np.ndarray, X: np.ndarray | None) -> tuple[np.ndarray, Any]:

@@ -16,7 +16,7 @@ STEEP = 5.0
 
 
 class Linear(NamedTuple):
-    """A function f(θ, x) of columns x (m, N) with its derivatives, None for those that were not asked for."""
+    """A function f(θ, x) of columns x (m, N) with its derivatives, None for those not requested."""
 
     value: np.ndarray  # (m, N)
     slope: np.ndarray | Any = None  # (m, m, N): ∂f/∂x
@@ -264,7 +264,7 @@ class Waves(Sum):
     ) -> Waves:
         """Harmonics to this order of the angles, which have a period, times powers of the others to this degree.
 
-        The constant, which moves nothing as a term of H, is the first term if it is asked for.
+        The constant, which has no effect as a term of H, is the first term if requested.
         """
         angles = np.isfinite(periods)
         span = [range(-harmonics, harmonics + 1) if angle else (0,) for angle in angles]
@@ -428,7 +428,7 @@ class Distances(Part):
 
     @classmethod
     def between(cls, bodies: np.ndarray, powers: Sequence[int], scale: float, central: bool = False) -> Distances:
-        """All powers of the distances of all pairs of bodies, and from the origin if asked for."""
+        """All powers of the distances of all pairs of bodies, and from the origin if requested."""
         n = len(bodies)
         lines = [*combinations(range(n), 2), *((a, None) for a in range(n) if central)]
         return cls(bodies, [(*line, e) for line in lines for e in powers], scale)

@@ -110,8 +110,8 @@ class Replicas:
     def bands(self, y0: ArrayLike, t: ArrayLike, level: float = 0.9) -> tuple[np.ndarray, np.ndarray]:
         """Bounds (2d, n) and (2d, n) between which the true orbit from y0 lies at each time with this probability.
 
-        They lie t standard deviations of the replicas about the orbit of the flow, t by Student's distribution, for few
-        replicas of few trajectories tell these deviations but roughly. The family of models is taken for true.
+        They lie t standard deviations of the replicas about the orbit of the flow, t by Student's distribution, because
+        few replicas of few trajectories give only rough deviations. The family of models is taken for true.
         """
         if not 0 < level < 1:
             raise ValueError(f"`level` must lie between 0 and 1; got {level!r}: 0.9 is usual.")
@@ -133,8 +133,8 @@ def replica(common: tuple[Model, Trajectories, Setting, np.ndarray, int], number
 def without_growth(found: Fitted, settled: bool = True) -> Fitted:
     """The fit with rates of friction that are not negative: those below 0 are 0, and other numbers the best beside.
 
-    Of data without friction chance makes half of the rates negative. One that is more than chance is told, if the fit
-    came to its end.
+    Of data without friction chance makes half of the rates negative. A significant one is reported, if the fit was
+    completed.
     """
     model, theta = found.model, found.theta
     growing = np.arange(model.n) >= np.where(theta < 0, model.n - model.forces, model.n)
@@ -401,7 +401,7 @@ class Search:
             self.best = simple
 
     def save(self, session: Session) -> None:
-        """Write a checkpoint, if one is asked for."""
+        """Write a checkpoint, if a path was given."""
         if session.checkpoint is not None:
             fits = {
                 name: {key: torch.as_tensor(v) if isinstance(v, np.ndarray) else v for key, v in numbers.items()}

@@ -1,4 +1,4 @@
-"""Functions that are the same at all points of the data: H is not told along them, for g − g₀ squared moves nothing."""
+"""Functions that are the same at all points of the data: there (g − g₀)² has no effect, and H is not determined."""
 
 from __future__ import annotations
 

@@ -43,7 +43,7 @@ LOG_2 = float(np.log(2.0))
 
 @dataclass(frozen=True, repr=False)
 class Indicator(OfOrbits):
-    """A chaos indicator of each orbit, at its end and at the times that were asked for.
+    """A chaos indicator of each orbit, at its end and at the times of `t_eval`.
 
     Attributes
     ----------

@@ -43,8 +43,7 @@ class Escapes(OfOrbits):
     state : ndarray of shape (..., 2d)
         The state then; NaN of an orbit that did not escape.
     status : int or ndarray of shape (...)
-        1 where the orbit escaped, 0 where it stayed to the end, −1 where it ceased to be finite before it was seen
-        outside.
+        1 where the orbit escaped, 0 where it stayed to the end, −1 where it became non-finite before it was outside.
     message : str
     """
 

@@ -2,10 +2,10 @@
 
 A step h of a splitting of H = (p² + ω²q²)/2 is a linear map of determinant 1 that depends on z = hω alone. Its orbits
 are bounded where |½ tr| < 1, and grow by a factor a step where |½ tr| > 1 [1]_, [2]_. With kicks and drifts ½ tr is a
-polynomial in z², the *stability polynomial*, with rational coefficients: those of the table. It tells for certain what
-runs may miss, windows of instability too narrow for any list of steps.
+polynomial in z², the *stability polynomial*, with rational coefficients: those of the table. It finds windows of
+instability that are too narrow for any list of steps.
 
-Of any other method the step is differentiated at an equilibrium: there the spectral radius tells, at closely spaced
+Of any other method the step is differentiated at an equilibrium: there the spectral radius is tested at closely spaced
 steps.
 
 References

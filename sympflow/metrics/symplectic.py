@@ -1,8 +1,8 @@
 """Phase-space volume, the symplectic form and transported area, judged on the map as it was executed.
 
-The run is executed again from y0 as a stream of its steps (`Integrator.steps`), each of which is differentiated
-(`Integrator.tangent`) where it was taken; nothing presumes that the method is symplectic. The memory is that of a few
-hundred steps. The Jacobian of the whole run is never formed: on a chaotic orbit its determinant is rounding noise.
+The run is executed again from y0 as a stream of its steps (`Integrator.steps`), each is differentiated
+(`Integrator.tangent`) at its state; the method is not assumed to be symplectic. The memory is that of a few hundred
+steps. The Jacobian of the whole run is never formed: on a chaotic orbit its determinant is rounding noise.
 """
 
 from __future__ import annotations

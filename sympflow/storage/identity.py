@@ -1,4 +1,4 @@
-"""Identities of calls: digests of what a store is made of, by which it knows the same call again in any process.
+"""Identities of calls: digests of the call that made a store, by which the same call is recognised in any process.
 
 A digest is of the thing itself: arrays by their bytes, functions by their code with its defaults, its closure and the
 globals that it names, classes by their members and bases, objects by their class and state. Code of the standard
@@ -41,10 +41,10 @@ class Identified(Protocol):
 
 @dataclass
 class Known:
-    """The identity of a call, by which a store knows it again: texts by the names of arguments and the like.
+    """The identity of a call, by which a store recognises it: texts by the names of arguments and the like.
 
     `python` are the names of those in which there are functions or objects of Python, and not values alone; `untold`
-    those with a part that cannot be told from another, and that part.
+    those with a part that cannot be compared, and that part.
     """
 
     texts: dict[str, str] = field(default_factory=dict)

@@ -1,8 +1,8 @@
 """The layout of results outside of sympflow: names, dimensions and attributes of Datasets, stores and tables.
 
 A state [q, p] is two arrays, `q` and `p`, with the dimensions (…, dof, time), those of a batch in front; `q0` and `p0`
-are the initial ones, `status` says what became of each orbit. `dof` counts from 1, as q1 … qd do. `time` has no
-attribute "units", by which xarray would take it for dates. The attributes of the whole are flat: texts and numbers.
+are the initial ones, `status` is that of each orbit. `dof` counts from 1, as q1 … qd do. `time` has no attribute
+"units", by which xarray would take it for dates. The attributes of the whole are flat: texts and numbers.
 """
 
 from __future__ import annotations

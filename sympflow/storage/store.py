@@ -8,8 +8,8 @@ A store is written here and not by the zarr library because of three guarantees:
   readers take: `Store.commit`. A program that is killed at any moment leaves the store of the last commit.
 - Nothing is imported for it: a worker that writes chunks needs neither zarr nor xarray.
 
-A store is taken for a stranger's: names in it are names and never paths, no folder of it is a link, what it tells is
-held against the call that opens it, and nothing is unpacked beyond the size that this gives.
+A store is not trusted: names in it are never used as paths, no folder of it may be a link, its contents are compared
+with the call that opens it, and nothing is unpacked beyond the size of that call.
 
 `xarray.open_zarr(path)` and `zarr.open_group(path)` read a store.
 """

@@ -118,7 +118,7 @@ def instants(t0: float, t1: float, n: int, dt: float) -> np.ndarray:
 
 @dataclass(frozen=True, repr=False)
 class Row:
-    """The measurements of one method; None where a figure was not asked for, does not apply or could not be had.
+    """The measurements of one method; None where a figure was not requested, does not apply or could not be computed.
 
     Errors, drift and defect are inf where the run became non-finite or could not be continued. The repr shows the
     figures that are there. Those of the metrics are attributes too: they are kept in `figures`, by their names.
@@ -129,9 +129,9 @@ class Row:
     status : str
         "ok"; "failed", if the run did not reach the end, or the method broke; "not applicable", if it could not run.
         In work and precision also "uncertain", if the error is not 100 times the reference's own. In a study of
-        stability instead of "ok": "stable"; "bounded", as stable, but the energy error exceeds 1: the result says
-        nothing; "outside", if a run of a trained flow left the domain that the flow was trained on, where it says
-        nothing either; "unstable", if a run became non-finite, could not go on, or its energy error exceeded the bound.
+        stability instead of "ok": "stable"; "bounded", as stable, but the energy error exceeds 1, so that the result is
+        useless; "outside", if a run of a trained flow left the domain that the flow was trained on, where it is not
+        valid; "unstable", if a run became non-finite, could not go on, or its energy error exceeded the bound.
     reason : str
         Why it failed, and whatever else should be known.
     dt : float or None
@@ -328,7 +328,7 @@ class Attempt:
             return
 
     def measure(self, asked: Sequence[str], metrics: Mapping[str, Measure] | None = None) -> None:
-        """Enter the metrics asked for; one that cannot be had leaves a note, and so does a RuntimeWarning."""
+        """Enter the requested metrics; a failure leaves a note, and so does a RuntimeWarning."""
         if self.sol is None:
             return
         for name in asked:
@@ -370,7 +370,7 @@ class Measure:
 
 
 def accuracy(attempt: Attempt, truth: Reference) -> None:
-    """The distance from a reference; of a batch of which fewer trajectories were run, from their part of it."""
+    """The distance from a reference, or from the part of it that belongs to the trajectories that were run."""
     (sol,) = attempt.sols
     states = truth if sol.y.shape[:-1] == truth.y.shape[:-1] else truth.y[: len(sol.y0)]
     attempt.enter(error=float(np.median(largest(reference_error(sol, states), sol))))

@@ -320,7 +320,7 @@ def matched(
     Parameters
     ----------
     measure : callable
-        A positive figure of a run; inf if the run fails, which asks for smaller steps.
+        A positive figure of a run; inf if the run fails, so that smaller steps are tried.
     grows : bool
         True if the figure grows with the step (an error), False if it falls (a cost).
 
@@ -371,7 +371,7 @@ class Comparison(Compared):
     repeats : int
     match : str or None
     reference : Reference or None
-        The reference of the errors, if they were asked for.
+        The reference of the errors, if these were requested.
     rows : tuple of Row
     runs : tuple
         Behind each row: its solution (`.sol`) and the energy and volume errors over time (`.energy`, `.volume`).

@@ -71,7 +71,7 @@ def comparison_figure(comparison: Compared, kind: str = "overview") -> Figure:
     Raises
     ------
     ValueError
-        For an unknown kind, or one whose metric was not asked for.
+        For an unknown kind, or one whose metric was not requested.
     ImportError
         Without matplotlib.
     """
@@ -107,7 +107,7 @@ def save_comparison(
 def overview(comparisons: Sequence[Compared]) -> Figure:
     """One row for each system: error against run time, energy error over time, volume error over time.
 
-    Panels of metrics that were not asked for are left out.
+    Panels of metrics that were not requested are left out.
     """
     kinds = [k for k in _PANELS if any(k in _panels(c) for c in comparisons)]
     if not kinds:
@@ -449,7 +449,7 @@ def _shown(row: Row) -> float:
 def stability_map(
     all_rows: Sequence[Row], limits: Mapping[str, Sequence[tuple[float, float]]], missing: Sequence[str]
 ) -> Figure:
-    """A panel for each method: step against stiffness, coloured by energy error; × where it says nothing.
+    """A panel for each method: step against stiffness, coloured by energy error; × where it is not valid.
 
     Parameters
     ----------

@@ -158,7 +158,7 @@ def _sweep(candidate: Candidate, by_name: bool, steps: list[float], tolerances: 
 
 
 def measure_of(system: HamiltonianSystem) -> str:
-    """The figure of a row by which methods are judged on a system: of what its flow keeps, if that is an energy."""
+    """The figure of a row by which methods are compared on a system: the energy error, if its flow conserves energy."""
     return f"{kept_by(system)}_error".removeprefix("_")
 
 

@@ -241,7 +241,7 @@ class Study:
 
     @property
     def anchor(self) -> float:
-        """The step that the steps to be tried are multiples of, whatever steps were asked for."""
+        """The step whose multiples are tried, for any `steps`."""
         limit = 0.0 if self.linear is None else self.linear.limit
         return limit if 0 < limit < math.inf else float(self.system.dt)
 
@@ -351,7 +351,7 @@ class Study:
         return row.status in STABLE, math.inf if row.energy_error is None else row.energy_error
 
     def row(self, h: float | None) -> Row:
-        """Everything that is asked for at one step."""
+        """All measurements at one step."""
         self.say("" if h is None else f"dt = {h:.6g}")
         one = self.attempt(h, self.span(h))
         if one.sol is not None:

@@ -302,10 +302,10 @@ def toda_chain(n: int = 128, kappa: float = 0.5) -> HamiltonianSystem:
 
         e^{−r} − 1 = sinh² κ / cosh²(κ(i − i₀) − t sinh κ).
 
-    For small κ this is the soliton of the Korteweg–de Vries equation, r = −κ² sech²(κ(i − i₀ − (1 + κ²/6)t)), to which
-    every chain of such bonds comes close [1]_. The soliton starts a quarter of the chain before its middle and has
-    passed as much behind it at the end of the default interval. The domain is a box about it. `toda_lattice` is the
-    ring of few particles.
+    For small κ this is the soliton of the Korteweg–de Vries equation, r = −κ² sech²(κ(i − i₀ − (1 + κ²/6)t)), the limit
+    of every chain of such bonds [1]_. The soliton starts a quarter of the chain before its middle and has passed as
+    much behind it at the end of the default interval. The domain is a box about it. `toda_lattice` is the ring of few
+    particles.
 
     References
     ----------

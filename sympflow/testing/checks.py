@@ -1,8 +1,8 @@
 """check_integrator: the tests that every integrator, ours or a plug-in's, must pass.
 
-Each check is a function check(integrator, system) that raises an AssertionError which says what is wrong, or
-`NotApplicable` with the reason why there is nothing to check. They judge by the mathematics: the declared order by
-slope, the declared symplecticity by the Jacobian of the step that ran. They are in `laws`.
+Each check is a function check(integrator, system) that raises an AssertionError with the fault, or `NotApplicable` with
+the reason. They judge by the mathematics: the declared order by slope, the declared symplecticity by the Jacobian of
+the step that ran. They are in `laws`.
 """
 
 from __future__ import annotations

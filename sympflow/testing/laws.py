@@ -1,4 +1,4 @@
-"""The laws that every integrator keeps: of a bare step, of what `solve` gives, and between what is said twice."""
+"""The laws of every integrator: of a single step, of the results of `solve`, and the consistency of both."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ def a_step_length_for_each_state(integrator: Integrator, system: HamiltonianSyst
 
 
 def what_is_not_finite_stays_so(integrator: Integrator, system: HamiltonianSystem) -> None:
-    """A step from NaN is not finite, so that a blow-up is seen; other states of the batch do not notice."""
+    """A step from NaN is not finite, so that a blow-up is detected; other states of the batch are not affected."""
     step = _step(integrator, system)
     y = states(system, 3)
     h = np.full(3, 0.05)
@@ -343,7 +343,7 @@ def an_empty_interval(integrator: Integrator, system: HamiltonianSystem) -> None
 
 
 def a_blow_up_is_status_minus_one(integrator: Integrator, system: HamiltonianSystem) -> None:
-    """A run that becomes non-finite ends with status −1, keeps what was computed, and says when."""
+    """A run that becomes non-finite ends with status −1, keeps its outputs, and reports the time."""
     starts = [1e150 * np.ones(2 * system.ndof)]
     if system is default_system():
         starts.append(np.array([0.0, 0.0, 0.0, 0.7]))  # singular at t = 5.45
@@ -511,7 +511,7 @@ def _damped() -> tuple[HamiltonianSystem, np.ndarray, float]:
 
 
 def friction_is_in_the_steps(integrator: Integrator, system: HamiltonianSystem) -> None:
-    """A method that says `takes_friction` solves a damped system, to its order: nearer to it than to that without."""
+    """A method with `takes_friction` solves a damped system: its error is smaller than the effect of friction."""
     if not integrator.takes_friction:
         raise NotApplicable("it does not say that it takes friction, so damped systems are refused for it")
     damped, end, effect = _damped()
@@ -560,7 +560,7 @@ def _driven() -> tuple[HamiltonianSystem, np.ndarray, float]:
 
 
 def the_drive_is_in_the_steps(integrator: Integrator, system: HamiltonianSystem) -> None:
-    """A method that says `takes_driving` solves a driven system, to its order: nearer to it than to one held fixed."""
+    """A method with `takes_driving` solves a driven system: its error is smaller than the effect of the drive."""
     if not integrator.takes_driving:
         raise NotApplicable("it does not say that it takes H at its times, so driven systems are refused for it")
     driven, end, effect = _driven()
@@ -657,7 +657,7 @@ def save_every_thins_the_outputs(integrator: Integrator, system: HamiltonianSyst
 
 
 def a_batch_reports_its_failures(integrator: Integrator, system: HamiltonianSystem) -> None:
-    """The run of a batch, some of which blow up, has status −1 for these and 0 for the others."""
+    """The run of a batch in which some trajectories blow up has status −1 for these and 0 for the others."""
     y0 = np.stack([start(system), 1e150 * np.ones(2 * system.ndof)])
     times = np.array([0.0, 8.0])
     with np.errstate(all="ignore"):

@@ -2,7 +2,7 @@
 
     train(system, PrimedFit(stages=3, processor=6), solver=GaussNewton(restarts=24), budget=15)
 
-A fit says which flow is made and what it is compared with, a solver how its numbers are found. None stands for a choice
+A fit describes the flow and the data to which it is fitted, a solver the method of the fit. None stands for a choice
 that is left open. With the seed both determine the trained numbers. `from_keywords` makes them of plain keywords.
 """
 

@@ -3,10 +3,10 @@
 The numbers of a primed flow depend on the potential and Δt, not on the size. So they are fitted at states of the energy
 density of the large lattice. Held-out states and the certificate are those of the large one, with its own ends.
 
-One step on a few sites tells little of what a large lattice does to its energy in a thousand. The modified energy that
-a flow keeps differs from H by terms that hardly change in a step, such as the actions of waves whose frequencies are a
-bit wrong; these change as waves exchange energy, and a few sites have few wave lengths. So the best few tables at Δt
-that labels find are fitted further, to the errors of H in runs from many states of a larger ring.
+The error of one step on a few sites does not determine the energy error of a large lattice after a thousand. The
+modified energy that a flow keeps differs from H by terms that hardly change in a step, such as the actions of waves
+whose frequencies are a bit wrong; these change as waves exchange energy, and a few sites have few wave lengths. So the
+best few tables at Δt that labels find are fitted further, to the errors of H in runs from many states of a larger ring.
 """
 
 from __future__ import annotations
@@ -193,7 +193,7 @@ class EnergyRuns(RunsFit):
 
 
 def check_runs(system: HamiltonianSystem, fit: PrimedFit) -> None:
-    """Raise ValueError unless a flow of the system can be fitted to the `runs` that are asked for."""
+    """Raise ValueError unless a flow of the system can be fitted to `runs`."""
     if not (system.local is not None and system.local.has_subsystem and system.conservative):
         raise ValueError(
             f"`runs` need a lattice that conserves its energy, and {system.name!r} is not one: leave it out."

@@ -1,8 +1,8 @@
-"""The training of flows of planets: kicks of a processor by which the energies of states along one orbit are the same.
+"""The training of flows of planets: kicks of a processor that make the energies of states along one orbit equal.
 
 A kick b of the interaction changes the energy by b Δt Σ m v·a, to first order in b, wherever on the orbit it is made,
 since steps conserve energies far better. So the processor is found by linear least squares on the energy errors of
-plain steps, repeated with the errors that are left, and weighted by these, by which the largest become smaller.
+plain steps, repeated for the remaining errors, weighted by these, so that the largest become smaller.
 """
 
 from __future__ import annotations

@@ -108,7 +108,7 @@ class Run(ABC):
         return None
 
     def left_out(self) -> str | None:
-        """The words that say which part of Ω the fit says nothing of; None if there is none."""
+        """The words for the part of Ω in which the fit is not valid; None if there is none."""
         return None
 
     @property
@@ -223,7 +223,7 @@ class Run(ABC):
 
 
 class Unstarted(Run):
-    """A run for which there was no time: what it was to start from took longer. The flow stays as it is."""
+    """A run for which there was no time, because its preparation took longer. The flow stays as it is."""
 
     UNIT: ClassVar[str] = "steps"
 

@@ -26,7 +26,7 @@ LEAST_PART = 1.0  # seconds that a part of a budget has at least: what is compil
 
 
 class OutOfTime(Exception):
-    """Raised within a task whose time is up, or which Ctrl-C asked to end."""
+    """Raised within a task whose time is up, or that Ctrl-C ended."""
 
 
 class Interruption:
@@ -170,13 +170,13 @@ class Deadline:
         return self.end - time.perf_counter() if self.end < math.inf else math.inf
 
     def over(self) -> bool:
-        """Return whether to end: asked between steps."""
+        """Return whether to end: called between steps."""
         over = self.session.interruption.asked or self.left <= 0
         self.session.cut = self.session.cut or over
         return over
 
     def check(self) -> None:
-        """Raise OutOfTime if it is over: asked within a step."""
+        """Raise OutOfTime if it is over: called within a step."""
         if self.over():
             raise OutOfTime
 

@@ -1,4 +1,4 @@
-"""The primed flow to fit where nothing else is said, and domains and steps that suit no flow."""
+"""The default primed flow, and checks of domains and steps that are not suitable."""
 
 from __future__ import annotations
 

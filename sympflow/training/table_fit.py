@@ -1,9 +1,9 @@
 """The fit of a primed flow: the numbers of its splitting table, fitted to the exact flow of a system by Gauss–Newton.
 
 In three stages. First the table frozen at Δt, a dozen or two numbers, from many random starts, each followed for a
-few iterations: the cost has many local minima. Then the best of these to the end of their narrow valleys, at last with
-the weight of the energy, with which these are harder to find. Then the polynomials in t, from the best of these tables,
-to labels at several times in (0, Δt].
+few iterations: the cost has many local minima. Then the best of these are iterated to convergence, at last with the
+weight of the energy, which makes minima harder to find. Then the polynomials in t, from the best of these tables, to
+labels at several times in (0, Δt].
 
 Other losses (the residual of the flow, Hamiltonian matching) join in the last stage. Without labels there is that stage
 alone, from each start.

@@ -181,7 +181,7 @@ class ArrayErrors:
 
     @np.errstate(all="ignore")
     def __call__(self, c: np.ndarray, check: Check = lambda: None, linearized: bool = False) -> Any:
-        """The errors (m,) for numbers c (J, n), and if they are asked for their derivatives by these, (n, m)."""
+        """The errors (m,) for numbers c (J, n), and if requested their derivatives by these, (n, m)."""
         order = self.step.order
         c = np.repeat(c[:, np.argsort(order)].T, self._count, axis=1)
         if not linearized:

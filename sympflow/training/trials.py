@@ -1,4 +1,4 @@
-"""Short fits by which `train` chooses the flow to fit to a system of which nothing else is said."""
+"""Short fits by which `train` chooses the flow for a system if no options are given."""
 
 from __future__ import annotations
 

@@ -122,7 +122,7 @@ def balance_errors(sol: Any) -> Any:
 
 @dataclass(frozen=True)
 class ByRuns:
-    """Errors of runs in the physical time over T = t_end, at steps and between them; a certificate if it is asked."""
+    """Errors of runs in the physical time over T = t_end, at steps and between them; a certificate if requested."""
 
     errors: Callable[[Any], Any] = max_energy_error
     states: Callable[[HamiltonianSystem], np.ndarray] = of_domain

@@ -1,4 +1,4 @@
-"""Recipes of flows: how one was made and judged, as its file tells; so each that ships can be made again from it."""
+"""Recipes of flows: how a flow was made and measured, kept in its file, so that it can be made again."""
 
 from __future__ import annotations
 
