@@ -141,7 +141,7 @@ def learnable(*arrays: Any) -> bool:
 
 
 def differentiable(*arrays: Any) -> bool:
-    """Return True if torch follows one of these tensors, by any means: NumPy would silently drop what it follows."""
+    """Return True if torch follows one of these tensors, by any means: NumPy would silently drop its derivatives."""
     return learnable(*arrays) and (_keeps_graphs() or transformed(*arrays))
 
 

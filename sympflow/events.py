@@ -101,7 +101,7 @@ class EventSearch:
         return EventSearch(self.events, self.max_interval)
 
     def forget_after(self, t: float, h: float) -> None:
-        """Leave out what was found later in the run than at t, in steps of length h that were not searched."""
+        """Leave out events later in the run than t, in steps of length h that were not searched."""
         self.end = None
         for zeros in self.found:
             while zeros and (zeros[-1][0] - t) * h > 0:

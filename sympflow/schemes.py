@@ -95,7 +95,7 @@ class Scheme:
     name : str
         The method's name, the key in `SCHEMES`.
     order : int or None
-        Classical order of convergence; None where nothing is claimed (a trained table).
+        Classical order of convergence; None for a table without one, such as a trained one.
     kicks, drifts, gradients : tuple of float
         Coefficients b, a and g of the stages in their order of execution; zeros cost nothing. Without g all are zero.
         Other sequences of numbers become tuples.

@@ -185,7 +185,7 @@ def solve(
     Returns
     -------
     Solution
-        A run that becomes non-finite ends with status −1 and keeps what was computed. If the solution itself becomes
+        A run that becomes non-finite ends with status −1 and keeps the outputs so far. If the solution itself becomes
         infinite, the message and `stats["blow_up_time"]` say when, by an estimate.
 
     Raises

@@ -1,8 +1,8 @@
 """A map over workers: this thread, threads, processes, or an engine that a user hands in.
 
 The conventions are SciPy's and gala's: a number; an object with `.map`, as an Executor, a dask Client, a pool of
-schwimmbad or mpi4py; or a function such as `map` itself. Of an engine only `.map` is used, and what it returns may be
-values or futures of them. What a worker that died had to do is done again.
+schwimmbad or mpi4py; or a function such as `map` itself. Of an engine only `.map` is used, which may return values or
+futures. The task of a worker that died is repeated.
 """
 
 from __future__ import annotations
@@ -144,7 +144,7 @@ def _unpacked(packed: bytes) -> Any:
 
 @dataclass(frozen=True)
 class Answer:
-    """The result of a call, or what it raised."""
+    """The result of a call, or its exception."""
 
     index: int
     value: Any

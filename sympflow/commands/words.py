@@ -35,7 +35,7 @@ File = Path | None
 
 
 class Usage(ValueError):
-    """An error in a word of the command line, whose message names what was written."""
+    """An error in a word of the command line; the message quotes it."""
 
 
 def _systems(incomplete: str) -> list[str]:

@@ -1,4 +1,4 @@
-"""Traced numbers → a small program → LLVM IR → machine code. Knows nothing of Hamiltonian systems.
+"""Traced numbers → a small program → LLVM IR → machine code. It does not depend on Hamiltonian systems.
 
 Read in this order: `numbers` (what arithmetic is done with), `functions` (one table of what may be done), `program`
 (operations recorded, differentiated, evaluated with arrays), `arrange` (the order of operations), `control` (loops,

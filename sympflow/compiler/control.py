@@ -477,7 +477,7 @@ class Code:
 
     @contextmanager
     def over(self, count: Any) -> Iterator[Value]:
-        """Execute what is written inside for k = 0 … count − 1, none if the count is not positive."""
+        """Execute the code written inside for k = 0 … count − 1, not at all if the count is not positive."""
         count = self.operand(count, INT)
         k = self.variable(self.constant(0, INT))
         with self.during(lambda: k.value < count):
@@ -486,7 +486,7 @@ class Code:
 
     @contextmanager
     def during(self, condition: Callable[[], Value]) -> Iterator[None]:
-        """Execute what is written inside again and again while a condition holds."""
+        """Execute the code written inside while a condition holds."""
         head, inside, after, before = self._label(), self._label(), self._label(), self._block
         self._branch(head)
         self._begin(head, before)
@@ -498,7 +498,7 @@ class Code:
 
     @contextmanager
     def given(self, condition: Value) -> Iterator[None]:
-        """Execute what is written inside if a condition holds."""
+        """Execute the code written inside if a condition holds."""
         inside, after, before = self._label(), self._label(), self._block
         self._lines.append(f"  br i1 {condition.name}, label %{inside}, label %{after}")
         self._begin(inside, before)
@@ -515,7 +515,7 @@ class Code:
 
     @contextmanager
     def sweep(self, first: Value, last: Value, read: Callable[[Any, Value], Value]) -> Iterator[Sweep]:
-        """Execute what is written inside for k = first … last − 1, at least once, with values of other turns."""
+        """Execute the code written inside for k = first … last − 1, at least once, with values of other turns."""
         sweep = Sweep(self, first, read)
         outside, self._lines = self._lines, []
         head, after, before = self._label(), self._label(), self._block

@@ -1,4 +1,4 @@
-"""Numbers: what a stage calculates with. One kind of number, one interpretation of its operations.
+"""The numbers of a stage. One kind of number, one interpretation of its operations.
 
 A stage is a Python function that uses operators and the functions of `functions`. Called with NumPy arrays or tensors
 it computes; called with numbers of a kind of its own it records a program, writes machine code, expands polynomials.

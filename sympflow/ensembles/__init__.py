@@ -1,1 +1,1 @@
-"""Many runs at once: `sympflow.ensemble`, its chunks, what is kept of each orbit, and where it is stored."""
+"""Many runs at once: `sympflow.ensemble`, its chunks, the results of each orbit, and their stores."""

@@ -1,4 +1,4 @@
-"""Reductions to what the orbits do: chaos indicators, frequencies, escapes, crossings of a plane."""
+"""Reductions to properties of orbits: chaos indicators, frequencies, escapes, crossings of a plane."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The result of an ensemble: what was kept of each orbit, in memory or in a store, and its xarray Dataset."""
+"""The result of an ensemble: the fields of each orbit, in memory or in a store, and their xarray Dataset."""
 
 from __future__ import annotations
 
@@ -313,7 +313,7 @@ class Ensemble(Answering):
         return self.plot() if sum(x.size for x in self.fields.values()) <= MOST_SHOWN else None
 
     def plot(self, path: str | os.PathLike[str] | None = None) -> Figure:
-        """Draw what was kept: states in the plane of q₁ and p₁, the last ones where there are several; else histograms.
+        """Draw the results: states in the plane of q₁ and p₁, the last ones where there are several; else histograms.
 
         With a `path` (.png, .pdf or .svg) the figure is saved too; matplotlib is needed.
 
@@ -335,10 +335,10 @@ class Ensemble(Answering):
         return saved(histogram_figure(values, self.system.title), path)
 
     def to_xarray(self) -> xarray.Dataset:
-        """The fields as an `xarray.Dataset`; of a store it reads what is used of it, when it is used.
+        """The fields as an `xarray.Dataset`; from a store it is read when it is used.
 
         States are `q` and `p` with the dimensions (..., orbit, dof, time), the initial ones `q0` and `p0`. The
-        attributes say by what the data were made.
+        attributes describe how the data were made.
 
         Raises
         ------

@@ -29,7 +29,7 @@ def upper_limit(values: np.ndarray, quantile: float = QUANTILE, confidence: floa
 
 
 def sizes(values: np.ndarray) -> np.ndarray:
-    """|values|, and infinity for what is not a number."""
+    """|values|, and infinity for NaN."""
     return np.where(np.isnan(values), math.inf, np.abs(values))
 
 
@@ -111,12 +111,12 @@ class Certificate:
 
     @classmethod
     def from_dict(cls, description: dict[str, Any]) -> Certificate:
-        """The certificate that `to_dict` described; None stands for what was not finite.
+        """The certificate that `to_dict` described; None stands for values that are not finite.
 
         Raises
         ------
         ValueError
-            If the description is not one of a certificate.
+            If the description is not that of a certificate.
         """
         if isinstance(description, dict):
             description = {"relative_limit": None, **description}

@@ -85,7 +85,7 @@ class PrimedKnown(KnownFlow):
         return tables.carried
 
     def carried(self, system: HamiltonianSystem) -> Self:
-        """This flow, of another size of its system, with what is known of it."""
+        """This flow for another size of its system, with its records."""
         raise NotImplementedError
 
     def provenance_for(self, system: HamiltonianSystem) -> Provenance:

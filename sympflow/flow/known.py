@@ -1,4 +1,4 @@
-"""KnownFlow: the knowledge of a flow beside its map: its system, its domain, its figures, and where these hold."""
+"""KnownFlow: a flow's system, its domain, its figures, and where these hold, apart from its map."""
 
 from __future__ import annotations
 

@@ -176,7 +176,7 @@ class PrimedFlow(PrimedKnown, SystemFlow):
 
     @property
     def terms(self) -> int:
-        """The number of terms that a kick has beside V."""
+        """The number of terms of a kick in addition to V."""
         return len(self.monomials) or sum(c is not None for c in (self.gradients, self.curvatures))
 
     def _layer(self, i: int) -> Kick | Drift:
@@ -295,7 +295,7 @@ class PrimedFlow(PrimedKnown, SystemFlow):
         return self.of_size(system) if self._binding.known else self.bind(system)
 
     def carried(self, system: HamiltonianSystem) -> Self:
-        """This flow, of another size of its system, with what is known of it."""
+        """This flow for another size of its system, with its records."""
         other = self._of(system, self.shape).requires_grad_(False)
         other.provenance = self.provenance_for(system)
         return other

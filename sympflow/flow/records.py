@@ -54,7 +54,7 @@ class Refused(Exception):
 
 @dataclass
 class Provenance:
-    """The facts about a flow beside its map: its system, its domain, its figures, and where these hold."""
+    """The records of a flow apart from its map: its system, its domain, its figures, and where these hold."""
 
     domain: Domain | None = None  # Ω, where it was trained
     system_name: str | None = None  # of the system it was trained for

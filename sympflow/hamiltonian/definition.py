@@ -21,7 +21,7 @@ ASIDE = 64 * float(np.finfo(float).eps)
 
 
 def bare_copy(x: Any) -> Any:
-    """Return a copy of an object without what was found out of it, its cached properties."""
+    """Return a copy of an object without its cached properties."""
     other = copy.copy(x)
     for name in [name for name in vars(other) if isinstance(getattr(type(x), name, None), cached_property)]:
         del vars(other)[name]

@@ -157,7 +157,7 @@ class Identity:
 
     @classmethod
     def from_dict(cls, description: Any, ndof: int) -> Self:
-        """Return the identity that `to_dict` described; None stands for what was not finite."""
+        """Return the identity that `to_dict` described; None stands for values that are not finite."""
         names = {"states", "energies", "expression"}
         if not isinstance(description, Mapping) or set(description) != names:
             raise ValueError("it is not a table of states, energies and an expression")

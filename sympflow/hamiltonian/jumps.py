@@ -189,7 +189,7 @@ def check_continuous(
     values: Mapping[sp.Symbol, Any] | None = None,
     names: Mapping[sp.Symbol, str] | None = None,
 ) -> None:
-    """Refuse an expression that jumps in some of its symbols, where a force would be infinite for no time at all."""
+    """Refuse an expression that jumps in some of its symbols, where the force would be a delta function."""
     states = set(states)
     refuse_deltas(argument, f, names)
     numbers = {s: exact(float(v)) for s, v in (values or {}).items() if np.ndim(v) == 0}

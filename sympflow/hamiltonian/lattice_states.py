@@ -161,7 +161,7 @@ class LatticeStates:
 
 @dataclass(frozen=True)
 class Rest:
-    """A lattice at rest, all sites in one of the wells, and what is drawn about it."""
+    """A lattice at rest, all sites in one of the wells, and random states about it."""
 
     system: Hamiltonian
     parts: int  # sites

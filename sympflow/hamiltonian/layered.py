@@ -1,4 +1,4 @@
-"""Potentials with linear layers, such as networks that are trained: their weights are arguments of what is compiled."""
+"""Potentials with linear layers, such as trained networks: their weights are arguments of the compiled code."""
 
 from __future__ import annotations
 

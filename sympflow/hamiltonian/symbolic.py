@@ -639,7 +639,7 @@ def renamed(expression: str | sp.Expr, q: Any, p: Any) -> sp.Expr:
 
 
 def named_time(time: str | sp.Symbol | None, params: Mapping[str, Any]) -> sp.Symbol | None:
-    """The symbol of the time, "t" where a parameter is sampled and none is named; None without."""
+    """The symbol of the time, "t" if a parameter is sampled and no time is named; None without."""
     if time is None:
         if not any(isinstance(value, Samples) for value in params.values()):
             return None

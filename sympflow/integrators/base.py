@@ -102,7 +102,7 @@ class FixedStep(Integrator):
         return {"force_evaluations": 0, "hessian_evaluations": 0}
 
     def checked_step(self, system: HamiltonianSystem, t: Any, y: Array, h: Any) -> Array:
-        """`step`, with a message of its own where it fails on tensors."""
+        """`step`, with a specific message if it fails on tensors."""
         try:
             return self.step(system, t, y, h)
         except (TypeError, RuntimeError, AttributeError) as error:

@@ -258,7 +258,7 @@ def check_tolerance(tol: Any, tol_of: Any) -> None:
 
 
 def step_for(integrator: Integrator, problem: Problem, tol: float, tol_of: str = "energy") -> tuple[float, str]:
-    """The step of `choose_step` for a problem, and what its error is of: the "energy" or the "state"."""
+    """The step of `choose_step` for a problem, and the kind of its error: "energy" or "state"."""
     check_tolerance(tol, tol_of)
     if not isinstance(integrator, FixedStep) or integrator.trained:
         own = "a flow has its own: leave `tol` out"

@@ -87,7 +87,7 @@ def diagnose(
     action: str,
     interrupted: bool,
 ) -> None:
-    """Look at the outcome of a run: what it shows ends it, is added to its message, or is warned of."""
+    """Check the outcome of a run: a finding ends it, is added to its message, or causes a warning."""
     system, y0 = problem.system, problem.y0
     told = not interrupted and diagnose_piece(outcome, integrator, problem, rows)
     values, between = readable(outcome.y), system.between_impulses

@@ -105,7 +105,7 @@ class Run(ABC):
 
 
 class GridRun(Run):
-    """A run on the grid t0 + k·h: its steps in windows, the outputs among and within them, and what is not finite."""
+    """A run on the grid t0 + k·h: its steps in windows, the outputs among and within them, and non-finite states."""
 
     def __init__(self, integrator: Any, problem: Problem) -> None:
         self.grid = Grid(problem.t0, problem.t1, integrator.step_length(problem.system))

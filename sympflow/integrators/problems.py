@@ -186,7 +186,7 @@ def check_memory(integrator: Integrator, problem: Problem) -> None:
 
 
 def check_stored(problem: Problem, action: str, rows: ParameterRows | None) -> None:
-    """Refuse what a store does not take, with the reason."""
+    """Refuse options that a store does not support, with the reason."""
     check_array(problem.y0, "a `store` takes NumPy states, because it keeps no gradients", "y0.detach().numpy()")
     if problem.events is not None and problem.events.events:
         raise ValueError(

@@ -26,7 +26,7 @@ class Progress:
         self.done: Any = None
 
     def __call__(self, done: Any) -> None:
-        """Tell what is done by now."""
+        """Report the progress."""
         now = time.perf_counter()
         if self.first is None:  # a run that is resumed begins later than at 0
             self.first = done

@@ -1,4 +1,4 @@
-"""The provenance of a result: flat attributes that say by what it was made."""
+"""The provenance of a result: flat attributes that describe how it was made."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def known_by(system: HamiltonianSystem, integrator: Integrator, backend: str) ->
 
 
 def run_identity(problem: Problem, integrator: Integrator, dt: float | None) -> Known:
-    """Return what a stored run is known by: all but its end and the times of `t_eval`."""
+    """Return the identity of a stored run: all but its end and the times of `t_eval`."""
     known, y0 = known_by(problem.system, integrator, problem.backend), problem.y0
     known.texts |= {
         "dt": f"{dt!r}{', backwards' if problem.t1 < problem.t0 else ''}",

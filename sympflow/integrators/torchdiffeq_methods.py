@@ -82,7 +82,7 @@ class Trace:
         """Called with the slope f at each state y where torchdiffeq evaluates it."""
 
     def array(self, x: Any) -> Array:
-        """A tensor of torchdiffeq's as what the user gave."""
+        """A tensor of torchdiffeq's in the form that the user gave."""
         return of_library(x, self.y0)
 
     def announce(self, step: Interpolant) -> None:
@@ -176,7 +176,7 @@ class Watched(ByVectorField):
     max_num_steps: ClassVar[int | None] = None  # of a call, those that are tried and rejected included
 
     def outputs(self, problem: Problem) -> tuple[np.ndarray, dict[str, Any]]:
-        """The times to report, and what the statistics say of the steps."""
+        """The times to report, and the statistics of the steps."""
         raise NotImplementedError
 
     def integrate(self, trace: Trace, y: Any, length: float) -> None:

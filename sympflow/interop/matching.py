@@ -53,7 +53,7 @@ class Comparison:
     Attributes
     ----------
     given : callable or None
-        None for the system itself, with which there is nothing to compare.
+        None for the system itself, which needs no comparison.
     states_compared : int
         States at which the method's own velocity was evaluated so far.
     known : bool

@@ -142,7 +142,7 @@ class Path:
     def step(self, y: Tensor, h: float | Tensor, t: Any) -> Tensor:
         """A step of length h from the time t, each a number or one for each state.
 
-        By NumPy where nothing is to be differentiated.
+        By NumPy if nothing is differentiated.
         """
         return self._stepped(self.integrator.step, y, h, t)
 

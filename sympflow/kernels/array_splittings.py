@@ -175,7 +175,7 @@ class FunctionSplitting(Splitting):
 def addressed(function: Any, along: bool, timed: bool) -> Any:
     """A Numba function of arrays as one that C can call, with t, places q, v, out and their length.
 
-    What the function raises makes its result NaN. `along` is true of one that takes v, `timed` of one that takes t.
+    An exception of the function makes its result NaN. `along` is true of one that takes v, `timed` of one that takes t.
     """
     from numba import carray, cfunc, njit, types
 

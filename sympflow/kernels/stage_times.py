@@ -60,7 +60,7 @@ class Driving:
         return [*self.time_coefficients.values(), *(f for pair in self.means.values() for f in pair)]
 
     def check(self) -> None:
-        """Refuse what has no compiled form, by a ValueError."""
+        """Raise a ValueError for expressions without a compiled form."""
         _check((self.form.V, self.form.T, *self._expressions))
 
 

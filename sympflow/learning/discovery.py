@@ -100,7 +100,7 @@ class Regression:
         return np.sqrt(variance * np.diag(np.linalg.pinv(self.G[np.ix_(active, active)]))) / self.lengths[active]
 
     def misfit(self, active: list[int]) -> float:
-        """Root mean square of what is left."""
+        """Root mean square of the residuals."""
         return math.sqrt(self._solve(active)[1] / self.count)
 
     def criterion(self, active: list[int]) -> float:

@@ -296,7 +296,7 @@ def families(constraints: Constraints, name: str | None) -> list[str]:
     Raises
     ------
     ValueError
-        If there is no such family, or it contradicts what is known.
+        If there is no such family, or it contradicts the options.
     """
     if name is not None and name not in FAMILIES:
         raise ValueError(f"`family` {name!r} is unknown: choose from {', '.join(FAMILIES)}, or leave it out.")

@@ -1,4 +1,4 @@
-"""Pictures of a learned flow beside held-out trajectories."""
+"""Pictures of a learned flow together with held-out trajectories."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ FINE = 200  # points of a line
 
 
 def held_out_figure(flow: FlowMap, held: Trajectories) -> Any:
-    """Predictions of a learned flow beside held-out trajectories, and H along both.
+    """Predictions of a learned flow, held-out trajectories, and H along both.
 
     A prediction starts at the first state that was observed, with its noise.
 

@@ -1,4 +1,4 @@
-"""The fit of one model to trajectories, from nothing to whole orbits, and what held-out trajectories say of it."""
+"""The fit of one model to trajectories, from short segments to whole orbits, and its held-out errors."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Chaos of orbits by deviation vectors: the largest Lyapunov exponent, SALI and GALI.
 
 A deviation vector w is moved by the exact linearisation of each step that is made, the tangent map of the method, not
-by an integration of the variational equations with errors of its own [1]_.
+by a separate integration of the variational equations, which has other errors [1]_.
 
 References
 ----------

@@ -24,9 +24,9 @@ def energy_balance_error(sol: Solution, relative: bool = False) -> np.ndarray:
     """|H(t, x) − H(t0, x0) − ∫ ∂H/∂t dt| at the times `sol.t`: (..., n), in float64.
 
     The integral is computed by the method itself: −E, the momentum of the time in the extended system
-    E + H(t, x), which is autonomous. Its energy E + H is what a symplectic method keeps in the long run. A kick by b h
-    V(q, t) at its fixed time t adds b h ∂V/∂t to the integral, force gradients add the derivative of their term;
-    Runge–Kutta and implicit methods take ∂H/∂t at their stages, by their weights. For this the run is repeated,
+    E + H(t, x), which is autonomous. Its energy E + H is nearly conserved by a symplectic method in the long run. A
+    kick by b h V(q, t) at its fixed time t adds b h ∂V/∂t to the integral, force gradients add the derivative of their
+    term; Runge–Kutta and implicit methods take ∂H/∂t at their stages, by their weights. For this the run is repeated,
     compiled if it was, with E as an additional momentum; it needs memory for the outputs only. Methods that choose
     their steps then control the error of E too.
 
@@ -71,7 +71,7 @@ def energy_balance_error(sol: Solution, relative: bool = False) -> np.ndarray:
 
 
 def kept_by(system: HamiltonianSystem) -> str:
-    """Return the name of what the flow of a system keeps: its "energy", or the "balance" of a drive, or "" for none."""
+    """The conserved quantity of a system: its "energy", or the "balance" of a drive, or "" for none."""
     if system.keeps_energy:
         return "energy"
     return "balance" if system.conservative and not system.definition.jumps else ""

@@ -54,7 +54,7 @@ class OfOrbits(Answering):
             return None
 
     def plot(self, path: str | os.PathLike[str] | None = None) -> Figure:
-        """Draw what was found. With a `path` (.png, .pdf or .svg) the figure is saved too; matplotlib is needed.
+        """Draw the result. With a `path` (.png, .pdf or .svg) the figure is saved too; matplotlib is needed.
 
         Raises
         ------

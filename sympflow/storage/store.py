@@ -2,7 +2,7 @@
 
 A store is written here and not by the zarr library because of three guarantees:
 
-- A chunk is a file of its own, written beside its place and moved there: it is whole or it is not there, and different
+- A chunk is a file of its own, written beside its place and moved there: it is complete or absent, and different
   processes write different chunks. Each has a checksum (zlib's, of data that it stores as they are).
 - Arrays grow, and attributes change, by the replacement of one file, ``.zmetadata``, the consolidated metadata that
   readers take: `Store.commit`. A program that is killed at any moment leaves the store of the last commit.
@@ -51,7 +51,7 @@ STORABLE = "biufc"  # kinds of dtypes that a store takes: truth values and numbe
 
 
 class StoreError(OSError):
-    """A store that cannot be read or written, as where the disk is full; what was committed before is kept."""
+    """A store that cannot be read or written, as on a full disk; committed data are kept."""
 
 
 @dataclass(frozen=True)
@@ -138,7 +138,7 @@ class Store:
     ) -> Store:
         """Make a store, with the values of some arrays of one chunk; the others have none.
 
-        It is made beside its place, and moved there: it is whole, or it is not there.
+        It is written under another name and renamed: it is complete or absent.
         """
         place = Path(path)
         for name in fields:
@@ -227,7 +227,7 @@ class Store:
                 raise self.damaged(f"its array {name!r} is missing")
 
     def damaged(self, why: str) -> StoreError:
-        """Return the error that says what is wrong with the store."""
+        """Return the error that describes the damage of the store."""
         return StoreError(f"`store` {str(self.path)!r} is damaged: {why}. Give another place, or a copy of it.")
 
     def _file(self, name: str, index: tuple[int, ...]) -> Path:

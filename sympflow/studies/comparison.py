@@ -163,7 +163,7 @@ def compare(
 
 
 def default_metrics(system: HamiltonianSystem) -> tuple[str, ...]:
-    """The metrics of what the flow of a system keeps."""
+    """The metrics of the conserved quantities of a system."""
     if system.between_impulses is not system:
         return ("error",)
     if system.conservative:
@@ -175,7 +175,7 @@ def default_metrics(system: HamiltonianSystem) -> tuple[str, ...]:
 
 
 def _check_apply(system: HamiltonianSystem, asked: Sequence[str], match: str | None) -> None:
-    """Refuse metrics of what the flow of a system does not keep."""
+    """Refuse metrics of quantities that are not conserved."""
     unkept = [m for m in asked if m != "error" and MEASURES[m].conserved]
     if unkept or match == "energy_error":
         what = f"which `metrics` {', '.join(map(repr, unkept))}" if unkept else "which `match` 'energy_error'"

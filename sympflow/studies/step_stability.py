@@ -533,7 +533,7 @@ class Search:
     bad : list of float
         Steps that are known to be unstable.
     found : dict
-        What was found, stable or not, for each step that was tried.
+        The result, stable or not, for each step that was tried.
     """
 
     study: Study

@@ -202,8 +202,8 @@ def three_body() -> HamiltonianSystem:
     (6.933464, 20.261804), (−2.003006, −6.872463), (−2.557673, −6.659112), where hardly a method gets: energy errors say
     little here.
 
-    The domain is a box that holds the bodies until t = 70, but for the momenta of close encounters: nothing to train
-    on. The default interval is (0, 70), the default step 1e-4.
+    The domain is a box that holds the bodies until t = 70, except for the momenta of close encounters: it is not
+    suitable for training. The default interval is (0, 70), the default step 1e-4.
 
     References
     ----------

@@ -637,7 +637,7 @@ def keywords() -> list[str]:
 
 
 def said(options: Mapping[str, Any]) -> dict[str, Any]:
-    """The keywords that say something: not those that are None, or what is so without them."""
+    """The keywords with an effect: not those that are None or equal to the default."""
     kept = {name: plain(value) for name, value in options.items() if value is not None or name == "clip"}
     return {name: value for name, value in kept.items() if name not in DEFAULTS or value != DEFAULTS[name]}
 

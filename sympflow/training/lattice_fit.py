@@ -85,7 +85,7 @@ class LatticeSubsystem:
         return made
 
     def whole(self, fitted: PrimedFlow) -> PrimedFlow:
-        """The flow of the lattice with the numbers that were fitted, and what it achieves there."""
+        """The flow of the lattice with the fitted numbers, and its errors there."""
         flow = fitted.of_any_size(self.lattice)
         flow.domain = self.states
         flow.identify(self.lattice, self.states)

@@ -289,7 +289,7 @@ def step_errors(difference: np.ndarray) -> dict[str, float]:
 
 @np.errstate(all="ignore")
 def shares_missed(difference: np.ndarray, labels: Labels, unit: np.ndarray) -> tuple[float, float]:
-    """The share that is missed of what a step of Δt moves a state: mean over mean, median over median; 1 for x ↦ x."""
+    """The error of a step of Δt relative to the displacement: mean over mean, median over median; 1 for x ↦ x."""
     error, moved = (np.linalg.norm(v / unit, axis=-1) for v in (difference, labels.y[-1] - labels.x))
     return _share(error.mean(), moved.mean()), _share(np.median(error), np.median(moved))
 

@@ -100,7 +100,7 @@ class Run(ABC):
         return dict(self.flow.figures)
 
     def missed(self) -> tuple[float, float] | None:
-        """The share of what a step of Δt moves a state that the flow misses, see `shares_missed`; None if unknown."""
+        """The error of a step of Δt relative to the displacement, see `shares_missed`; None if unknown."""
         return None
 
     def missed_by_verlet(self) -> tuple[float, float] | None:
