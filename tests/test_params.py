@@ -137,10 +137,10 @@ class TestMetrics:
         ],
     )
     def test_each_trajectory_is_judged_by_its_own_system(self, system, y0, metric):
-        sol = solve(system, "verlet", (0, 1), y0, params={"lam": LAM}, dt=0.25)
-        each = [
-            metric(solve(system.with_params(lam=x), "verlet", (0, 1), y, dt=0.25)) for x, y in zip(LAM, y0, strict=True)
-        ]
+        masses = 1.1 + 0.2 * np.arange(len(LAM))
+        sol = solve(system, "verlet", (0, 1), y0, params={"m": masses, "lam": LAM}, dt=0.25)
+        systems = [system.with_params(lam=x, m=m) for x, m in zip(LAM, masses, strict=True)]
+        each = [metric(solve(own, "verlet", (0, 1), y, dt=0.25)) for own, y in zip(systems, y0, strict=True)]
         np.testing.assert_allclose(metric(sol), each, rtol=1e-9, atol=1e-14)
 
 

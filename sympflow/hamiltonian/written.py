@@ -259,7 +259,8 @@ class TextForm(TracedHamiltonian):
 
     def named(self, names: Sequence[str]) -> TracedHamiltonian:
         """The form with these parameters as letters, whatever their values."""
-        return _lettered(_read(self._of.source, self._of.params, self._of.timed, names), self._of.params)
+        params = {name: self._of.params[name] for name in names} | self._of.params  # in their order
+        return _lettered(_read(self._of.source, params, self._of.timed, names), params)
 
     @cached_property
     def written(self) -> SymbolicHamiltonian:
