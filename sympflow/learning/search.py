@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -35,7 +36,7 @@ from sympflow.learning.trajectories import Trajectories
 from sympflow.learning.unseen import remark_on, tube, unseen
 from sympflow.training import checkpoint as checkpoints
 from sympflow.training.least_squares import never
-from sympflow.training.session import Deadline, Path, Session, Silent
+from sympflow.training.session import Deadline, OutOfTime, Path, Session, Silent
 from sympflow.training.starts import step_of
 from sympflow.training.trainer import train
 
@@ -47,6 +48,7 @@ STEPPED = 100  # states by which the steps of a flow are chosen, where H is not 
 DOUBTFUL_SECONDS = 5.0  # for a flow of data that no symplectic map explains
 TABLE_SECONDS = 2.5  # that a flow takes, which is no more than 60 % of a time budget
 TABLE_SHARE = 0.3  # of a time budget, likewise
+DIAGNOSIS_SHARE = 0.5  # of the time left after the search, by which it ends to look for what data hold beside H
 HORIZONS = (1, 10, 100)  # in Δt, of the held-out errors
 POOR = 1e-3  # one-step error of a flow, relative to the spread of the data, that is worth a warning
 LEAST_SECONDS = 1.0  # for the flow, however late it is
@@ -428,7 +430,7 @@ class Search:
             elif self.unseen:
                 warn(remark_on(self.unseen))
             return
-        deadline = session.deadline
+        deadline = session.deadline.part(DIAGNOSIS_SHARE)
         if not math.isfinite(held.loudness):
             warn(
                 f"The time budget ended before the best model, {candidate.name}, was compared with held-out "
@@ -439,7 +441,10 @@ class Search:
             f"The best model, {candidate.name}, leaves residuals on held-out trajectories that are not noise: "
             f"{held.complaint}."
         )
-        free = None if deadline.over() else self.freedom(replace(self.setting, stop=deadline.over))
+        free = None
+        with suppress(OutOfTime):
+            deadline.check()
+            free = self.freedom(replace(self.setting, stop=deadline.check))
         if free is not None:
             what = "H without the time" if free.defect < SYMPLECTIC else "symplectic map"
             said += f" No {what} explains these data: {free.said} leaves {free.share:.1e} of the sum of squares."
@@ -492,6 +497,8 @@ class Search:
         if isinstance(reading.field, FreeField):
             rivals.append(self.constraints.whole(Polynomial.up_to(reading.field.degree + 1, "y", scales)))
         fit = fitting.fitted(reading.field, reading.of(data), setting.turned(reading.rows))
+        if setting.stop():
+            return None
         theirs = fitting.judged(fit, reading.of(others), self.setting.turned(reading.rows))
         left, share = theirs.squares(scales[[*reading.rows]]), 0.0
         if reading.numbers and not (_certain(reading.numbers, fit, theirs) and reading.possible(fit.theta)):
