@@ -16,7 +16,7 @@ import typer
 from rich.console import Console
 from typer import Option
 
-from sympflow.commands.words import OF_METHODS, Scene, Usage
+from sympflow.commands.words import OF_METHODS, NamedSystem, Usage
 from sympflow.show.cards import cut
 from sympflow.studies.reports import Column, text_table
 
@@ -217,7 +217,7 @@ def tell(folder: Path, written: list[Path]) -> None:
 
 
 def write_comparisons(
-    comparisons: list[Any], found: list[Scene], folder: Path, say: Callable[[str], None]
+    comparisons: list[Any], found: list[NamedSystem], folder: Path, say: Callable[[str], None]
 ) -> list[Path]:
     """For each system its CSV, JSON and figures; for several also one CSV and one figure of all."""
     from sympflow.show.style import save

@@ -281,7 +281,7 @@ def section(
         raise typer.Exit(1)
 
 
-def _starts(scene: words.Scene, y0: list[str] | None, orbits: int | None, seed: int) -> np.ndarray | None:
+def _starts(scene: words.NamedSystem, y0: list[str] | None, orbits: int | None, seed: int) -> np.ndarray | None:
     """The initial states of several orbits: those given, or so many of the domain."""
     if orbits is None:
         states = [words.state(text) for text in y0 or ()]

@@ -119,7 +119,7 @@ def made(scene: str, **params: Any) -> HamiltonianSystem:
 
 
 @dataclass(frozen=True)
-class Scene:
+class NamedSystem:
     """A system as named by the user.
 
     Attributes
@@ -151,7 +151,7 @@ def _defaults(factory: Callable[..., HamiltonianSystem]) -> dict[str, Any]:
     return {name: p.default for name, p in inspect.signature(factory).parameters.items()}
 
 
-def scenes(words: Sequence[str] | None, own: Sequence[str] | None = None) -> list[Scene]:
+def scenes(words: Sequence[str] | None, own: Sequence[str] | None = None) -> list[NamedSystem]:
     """Scenes from words such as ``henon-heiles``, ``harmonic-oscillator:omega=10:t_end=5`` and ``--omega 100``.
 
     A parameter behind two dashes holds for every scene that has it. A scene may be one of a file: ``file.toml``,
@@ -191,7 +191,7 @@ def scenes(words: Sequence[str] | None, own: Sequence[str] | None = None) -> lis
         raise Usage(str(error)) from error
 
 
-def _told_apart(found: list[Scene]) -> list[Scene]:
+def _told_apart(found: list[NamedSystem]) -> list[NamedSystem]:
     """The scenes with keys that differ, so that none overwrites the files of another."""
     keys = [scene.key for scene in found]
     nth = [keys[:i].count(key) + 1 for i, key in enumerate(keys)]
@@ -203,7 +203,7 @@ def shown(value: Any) -> str:
     return f"{value:g}" if isinstance(value, int | float) and not isinstance(value, bool) else str(value)
 
 
-def one_scene(words: Sequence[str] | None, own: Sequence[str] | None = None) -> Scene:
+def one_scene(words: Sequence[str] | None, own: Sequence[str] | None = None) -> NamedSystem:
     """The scene of a command that takes one system."""
     found = scenes(words, own)
     if len(found) != 1:
@@ -211,7 +211,7 @@ def one_scene(words: Sequence[str] | None, own: Sequence[str] | None = None) -> 
     return found[0]
 
 
-def interval(scene: Scene, t_start: float | None, t_end: float | None) -> tuple[float, float]:
+def interval(scene: NamedSystem, t_start: float | None, t_end: float | None) -> tuple[float, float]:
     """From the given start, or the scene's, to the end: with the scene, by --t-end, or its own."""
     start, end = scene.system.t_span
     asked = [at for at in (scene.t_end, t_end) if at is not None]
@@ -325,7 +325,9 @@ def _parted(word: str) -> tuple[str, Callable[..., HamiltonianSystem], list[str]
     return name, make, [pair for pair in pairs if pair]
 
 
-def _scene(name: str, factory: Callable[..., HamiltonianSystem], pairs: list[str], shared: dict[str, str]) -> Scene:
+def _scene(
+    name: str, factory: Callable[..., HamiltonianSystem], pairs: list[str], shared: dict[str, str]
+) -> NamedSystem:
     own = dict(_pairs(pairs))
     t_end = _float("t_end", own.pop("t_end")) if "t_end" in own else None
     known = inspect.signature(factory).parameters
@@ -335,7 +337,7 @@ def _scene(name: str, factory: Callable[..., HamiltonianSystem], pairs: list[str
     asked = {f"--{key}": value for key, value in shared.items() if key in known and key not in own} | own
     params = {key.lstrip("-"): _value(key, word, known[key.lstrip("-")]) for key, word in asked.items()}
     key = "-".join([name, *(f"{k}={shown(v)}" for k, v in params.items())])
-    return Scene(key, factory(**params), t_end, factory, params)
+    return NamedSystem(key, factory(**params), t_end, factory, params)
 
 
 def _value(name: str, word: str, parameter: inspect.Parameter) -> Any:
@@ -355,7 +357,7 @@ def _value(name: str, word: str, parameter: inspect.Parameter) -> Any:
     return number
 
 
-def varied(scene: Scene, words: str) -> tuple[str, list[Any]]:
+def varied(scene: NamedSystem, words: str) -> tuple[str, list[Any]]:
     """A parameter of a scene and its values, from ``omega=1,10,100``."""
     name, equals, values = words.partition("=")
     if not (equals and values):
