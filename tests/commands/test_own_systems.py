@@ -152,7 +152,7 @@ def test_every_command_that_takes_a_system_takes_it(words):
         ("own.py:number", "must return a HamiltonianSystem; it returns int"),
         (
             "own.py:fails",
-            "`system` 'fails' in 'own.py' failed (ZeroDivisionError: division by zero, line 21): mend it.",
+            "`system` 'fails' in 'own.py' failed (ZeroDivisionError: division by zero, line 21): correct it.",
         ),
         (
             "own.py:needs",
@@ -191,7 +191,7 @@ def test_a_wrong_word_is_named(word, message, files):
         ("f.toml", 'hamiltonian = "p**2 + q**2"\n[domain]\nkind = "Box"\nlow = [1, 2]', "`domain` is not a Box"),
         ("f.toml", 'hamiltonian = "p**2"\n[domain]\nkind = "Box"\nr = 1', "`domain` has a key 'r', but a Box has low"),
         ("f.py:x", "import a_module_that_is_not_there", "`system` 'f.py' cannot be run (ModuleNotFoundError"),
-        ("f.py:x", "def f(:", "`system` 'f.py' cannot be run (SyntaxError: invalid syntax, line 1): mend it."),
+        ("f.py:x", "def f(:", "`system` 'f.py' cannot be run (SyntaxError: invalid syntax, line 1): correct it."),
         ("f.py", "x = 1", "`system` 'f.py' lacks the name of a system in it (it has none)"),
     ],
 )

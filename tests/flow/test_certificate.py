@@ -123,7 +123,7 @@ def test_a_certificate_is_of_the_weights_it_was_made_of(tmp_path):
 @pytest.mark.parametrize(
     ("edit", "message"),
     [
-        (lambda c: c.pop("delta"), "not one of a certificate"),
+        (lambda c: c.pop("delta"), "not the description of a certificate"),
         (lambda c: c.update(delta=3.0), "delta that is not made of quantiles"),
         (lambda c: c["delta"].update(median="0"), "median that is not a number"),
         (lambda c: c["delta"].update(median=-1.0), "median that is not a number"),

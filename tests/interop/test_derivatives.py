@@ -328,9 +328,9 @@ def test_the_state_at_a_terminal_event_of_solve_says_that_it_has_no_derivative()
         return y[0] - 0.9
 
     crossing.terminal = True
-    with pytest.warns(UserWarning, match="carries no derivative.*odeint_event"):
+    with pytest.warns(UserWarning, match="has no gradient.*odeint_event"):
         jacfwd(lambda y: solve(PENDULUM, "verlet", (0.0, 5.0), y, events=crossing).y)(Y[0])
-    with pytest.warns(UserWarning, match="carries no derivative.*odeint_event"):
+    with pytest.warns(UserWarning, match="has no gradient.*odeint_event"):
         solve(PENDULUM, "verlet", (0.0, 5.0), Y[0].clone().requires_grad_(True), events=crossing)
     assert solve(PENDULUM, "verlet", (0.0, 5.0), Y[0], events=crossing).status == 1
 
