@@ -27,7 +27,7 @@ def test_newtons_iterations_are_counted(tmp_path):
     compiled = solve(WHOLE, flow, (0, 5.3))
     assert compiled.stats["force_evaluations"] == 2 * compiled.stats["newton_iterations"] > 0
     flow.save(tmp_path / "flow.safetensors")
-    with pytest.raises(ValueError, match="made of steps with the H of a system, which its file does not hold"):
+    with pytest.raises(ValueError, match="made of steps with the H of a system, which is not in its file"):
         sympflow.load(tmp_path / "flow.safetensors").psi(0.1, torch.zeros(2, dtype=torch.float64))
     x = torch.as_tensor(WHOLE.y0)
     expected = flow(0.7, x)

@@ -149,10 +149,6 @@ test_other_systems = refusals(
     (lambda: SympFlow(1).certificate(FREE), "^`flow` has no domain"),
     (lambda: three.check_system(PENDULUM), "`system` .* has 1 degrees of freedom but the flow 2"),
     (lambda: solve(HH, MLPFlow(2), (0, 1), backend="compiled"), "^`backend` .* apply. `method` 'mlp'"),
-    (
-        lambda: solve(HH, still, (0, 1), torch.tensor(HH.y0, requires_grad=True), backend="compiled"),
-        "^`backend` 'compiled' does not apply. `y0` requires gradients",
-    ),
 )
 
 test_files = refusals(
