@@ -128,9 +128,11 @@ class _Reader:
         whole = exponent.denominator == 1
         if isinstance(base, Fraction):
             return base ** int(exponent) if whole else Fraction(float(base) ** float(exponent))
+        if whole and base.name == "mul":  # as SymPy, which spreads powers over products
+            factors = [Fraction(x) if isinstance(x, float) else x for x in base.args]
+            if exponent > 0 or len(self._parted(factors)[1]) < 2:
+                return self._product([self._power(x, exponent) for x in factors])
         if base.order in self.fixed:
-            if base.name == "mul" and whole and isinstance(base.args[0], float):
-                return self._product([Fraction(base.args[0]) ** int(exponent), self._power(base.args[1], exponent)])
             return self._marked(apply("pow", base, float(exponent)), [base])
         if base.name in ("sqrt", "pow", "div") and not (base.name == "sqrt" and exponent == -1):  # joined by SymPy
             raise NotPlain
