@@ -261,7 +261,8 @@ class TextForm(TracedHamiltonian):
 
     def named(self, names: Sequence[str]) -> TracedHamiltonian:
         """The form with these parameters as letters, whatever their values."""
-        params = {name: self._of.params[name] for name in names} | self._of.params  # in their order
+        first = {name: self._of.params[name] for name in names}  # in their order
+        params = {**first, **self._of.params}
         return _lettered(_read(self._of.source, params, self._of.timed, names), params)
 
     @cached_property
@@ -282,7 +283,7 @@ class Lettered:
 
 
 class WrittenHamiltonian(Definition):
-    """H = ½ pᵀM⁻¹p + V(q) as a text, by its program; `symbols` are made of the text when they are asked for."""
+    """H = ½ pᵀM⁻¹p + V(q, t) as a text, by its program; `symbols` are made of the text when they are asked for."""
 
     separable = has_third_derivative = symbolic = True
 
