@@ -150,10 +150,12 @@ def values(x: Any) -> np.ndarray | None:
     plain, order = _behind(x)
     if plain is None or isinstance(plain, np.ndarray):
         return plain
+    if isinstance(order, range):
+        return plain.numpy()
     import torch
 
     with torch._C._DisableFuncTorch():
-        return plain.detach().cpu().numpy().transpose(order)
+        return plain.cpu().numpy().transpose(order)
 
 
 def values_of_times(t: Any, remedy: str) -> np.ndarray:
@@ -217,7 +219,10 @@ def _behind(x: Any) -> tuple[Any, Sequence[int]]:
 
     if torch.compiler.is_dynamo_compiling():
         return None, []
-    functorch, axes = torch._C._functorch, list(range(x.ndim))
+    functorch = torch._C._functorch
+    if type(x) is torch.Tensor and x.is_cpu and functorch.peek_interpreter_stack() is None:
+        return x.detach(), range(x.ndim)
+    axes = list(range(x.ndim))
     with torch._C._DisableFuncTorch():
         while functorch.is_functorch_wrapped_tensor(x):
             if functorch.is_batchedtensor(x):
