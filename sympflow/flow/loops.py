@@ -21,7 +21,7 @@ from sympflow.schemes import CURVATURE, Scheme
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.parts import ExactParts
-    from sympflow.kernels.reverse import Between, Recorded
+    from sympflow.kernels.reverse import Between, Chained, Recorded
     from sympflow.kernels.rollouts import SplittingRollouts
 
 ONE = np.ones(1, dtype=np.int64)
@@ -63,7 +63,7 @@ class PrimedFlowKernel(Kernel):
         if self._tables.processed and self._splitting.friction:
             super().check_reverse()
 
-    def recorded(self, task: Task) -> Between | Recorded:
+    def recorded(self, task: Task) -> Between | Chained | Recorded:
         if not self._tables.processed:
             return self._kernel(task.h).recorded(task._replace(h=abs(task.h)))
         from sympflow.kernels.reverse import Between, Recorded

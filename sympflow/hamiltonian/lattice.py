@@ -90,6 +90,26 @@ class LatticeHamiltonian(LocalHamiltonian):
 
     has_subsystem = True
 
+    def along_vectors(self) -> Self:
+        """The lattice of K = v·∂H/∂q + w·∂H/∂p, which moves states with tangent vectors [v, w].
+
+        Its positions are [q, v] and its momenta [w, p]. A step of a splitting method for K is one for H with its
+        derivative.
+        """
+        other, n = bare_copy(self), len(self.fields)
+        other.fields, other.ndof = (*self.fields, *(f"{name}_along" for name in self.fields)), 2 * self.ndof
+        other.x, other.p, other.r, other.v, other.w = (numbered(kind, other.fields) for kind in "xprvw")
+
+        def along(f: sp.Expr, own: Sequence[Any], at: Sequence[Any], vector: Sequence[Any]) -> sp.Expr:
+            there = dict(zip(own, at, strict=True))
+            return sp.Add(*[sp.diff(f, s).xreplace(there) * v for s, v in zip(own, vector, strict=True)])
+
+        other.T = along(self.T, self.p, other.p[n:], other.p[:n])
+        other.U = along(self.U, self.x, other.x[:n], other.x[n:])
+        other.bonds = {k: along(V, self.r, other.r[:n], other.r[n:]) for k, V in self.bonds.items()}
+        other._set_mass()
+        return other
+
     def judged(self) -> tuple[Any, ...]:
         if not self.uniform or self.ndof <= MOST_JUDGED:
             return ()

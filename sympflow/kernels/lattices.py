@@ -26,6 +26,8 @@ from sympflow.compiler.program import Program, Traced, derivatives, gradient, re
 from sympflow.hamiltonian.formulas import evaluator
 from sympflow.hamiltonian.lattice import LatticeHamiltonian
 from sympflow.hamiltonian.monomials import Monomials
+from sympflow.kernels.protocol import Kernel, Task
+from sympflow.kernels.reverse import Chained
 from sympflow.kernels.rollouts import aligned, zeros
 from sympflow.kernels.runs import Numbers, Room
 from sympflow.kernels.teams import Member, SharedMemory, SharedRollouts, meet
@@ -77,7 +79,8 @@ class Form:
         terms |= {k: (lattice.bonds[k], lattice.r) for k in sorted(lattice.bonds)}
         values = zip(lattice.c, lattice.params.values(), strict=True)
         arrays = frozenset(s for s, value in values if isinstance(value, np.ndarray))
-        given = tuple(terms.items()), (*lattice.v, *lattice.w), lattice.c, arrays, lattice.inverse_mass is None
+        unit_masses = lattice.quadratic_kinetic and lattice.inverse_mass is None
+        given = tuple(terms.items()), (*lattice.v, *lattice.w), lattice.c, arrays, unit_masses
         boundary = tuple(lattice.boundary[axis] for axis in order)
         return cls(*given, boundary, level, compensated, damped, width, even)
 
@@ -922,6 +925,30 @@ class LatticeCode(SharedRollouts):
 
     def stage(self, room: Any, numbers: Numbers, kind: Value, step: Value) -> Any:
         self._stages.stage(room, numbers, kind)
+
+    def check_reverse(self) -> None:
+        if self._given[1]:
+            super().check_reverse()
+
+    def chained(self, kernel: Kernel, task: Task, table: np.ndarray) -> Chained:
+        """The run with its reverse: of the symplectic map A of tangent vectors Aᵀ = ΩA⁻¹Ωᵀ, by the inverse step."""
+        n, stages = self.n_out // 2, np.delete(table, -2, axis=1)  # without the link of two steps
+        inverse = np.zeros((len(table), stages.shape[1] + 1))
+        inverse[0, :-1], inverse[1:, 1:] = -stages[0, ::-1], -stages[1:, ::-1]
+
+        def pull(states: np.ndarray, cotangents: np.ndarray) -> np.ndarray:
+            vectors = np.concatenate([-cotangents[:, n:], cotangents[:, :n]], axis=1)
+            rows = np.concatenate([states[:, :n], vectors, states[:, n:]], axis=1)
+            self._along.mapped(inverse, rows, rows)
+            return np.concatenate([rows[:, 2 * n : 3 * n], -rows[:, n : 2 * n]], axis=1)
+
+        return Chained(kernel, task, pull)
+
+    @cached_property
+    def _along(self) -> LatticeCode:
+        """The same of states with tangent vectors."""
+        lattice, _, level, _ = self._given
+        return LatticeCode(lattice.along_vectors(), False, level, False)
 
     def members(self, meeting: np.ndarray, stop: np.ndarray, threads: int, block: int) -> Callable[[int], Member]:
         slabs = self._slabs(threads)

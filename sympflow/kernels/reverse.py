@@ -180,17 +180,20 @@ class Between:
 
 
 class Chained:
-    """A run of an autonomous kernel whose cotangents are pulled back by the Jacobians of its steps, as of `Recorded`.
+    """A run of an autonomous kernel whose cotangents are pulled back step by step, as of `Recorded`.
 
-    The Jacobians of a segment are made together. Where there are several, the place at which each begins is kept, and
-    it is run again, with the same bits.
+    This is done by the Jacobians of its steps, those of a segment together, or by ``pull(states, cotangents)``, where
+    states (N, 2d) are those after a step. The place at which each segment begins is kept; where there are several, each
+    is run again, with the same bits.
     """
 
-    def __init__(self, kernel: Kernel, task: Task) -> None:
-        self._kernel = kernel
+    def __init__(
+        self, kernel: Kernel, task: Task, pull: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None
+    ) -> None:
+        self._kernel, self._pull = kernel, pull
         self._task = task = task._replace(y0=given(task.y0), save=given(task.save, np.int64))
         n_rows, size = task.y0.shape
-        steps = max(1, SEGMENT // (n_rows * size * size))
+        steps = max(1, (SEGMENT // size if pull is None else MOST_KEPT) // (n_rows * size))
         self._ends = [*pairwise([*range(0, task.n_steps, steps), task.n_steps])]
         self._starts, self._places = [task.y0], [RunCheckpoint()]
         self._states: np.ndarray | None = None
@@ -218,15 +221,20 @@ class Chained:
 
     def pulled(self, cotangents: np.ndarray, slopes: bool) -> tuple[np.ndarray, np.ndarray]:
         """The cotangents of the states (N, 2d), for those of the outputs (N, len(save), 2d)."""
-        (h, y0, *_), total = self._task, np.zeros_like(self._task.y0)
+        total = np.zeros_like(self._task.y0)
         for i, (first, to) in reversed([*enumerate(self._ends)]):
             states = self._run(i)[0] if self._states is None else self._states
-            before = np.concatenate([self._starts[i][:, None], states[:, :-1]], axis=1).reshape(-1, y0.shape[1])
-            made = self._kernel.tangents(np.full(len(before), h), before)
-            assert made is not None  # after `check_reverse`
-            reversed_steps = made[1].reshape(*states.shape, -1).swapaxes(-1, -2)
+            pull = self._pull or self._by_jacobians(np.concatenate([self._starts[i][:, None], states[:, :-1]], axis=1))
             for n in range(to, first, -1):
                 changed = total + cotangents[:, slice(*self._asked(n - 1, n))].sum(1)
-                changed = np.matmul(reversed_steps[:, n - first - 1], changed[..., None])[..., 0]
+                changed = pull(states[:, n - first - 1], changed)
                 total = np.where(n <= self.n_finite[:, None], changed, 0.0)
-        return total + cotangents[:, : begun_in(self._task.save)].sum(1), np.zeros((0, len(y0)))
+        return total + cotangents[:, : begun_in(self._task.save)].sum(1), np.zeros((0, len(total)))
+
+    def _by_jacobians(self, before: np.ndarray) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+        """The reverse of the steps from states (N, m, 2d), the last one first."""
+        rows = before.reshape(-1, before.shape[-1])
+        made = self._kernel.tangents(np.full(len(rows), self._task.h), rows)
+        assert made is not None  # after `check_reverse`
+        later = iter(made[1].reshape(*before.shape, -1).transpose(1, 0, 3, 2)[::-1])
+        return lambda _, cotangents: np.matmul(next(later), cotangents[..., None])[..., 0]

@@ -171,6 +171,10 @@ class Rollouts(ABC):
         """Raise a ValueError, with the reason, where stages have no compiled reverse."""
         raise NotCompiled("`system` has compiled loops without a reverse, which gradients need: use backend='array'.")
 
+    def chained(self, kernel: Any, task: Task, table: Any) -> Any:
+        """The run of a kernel with a reverse step by step, see `reverse.Chained`; None where stages are reversed."""
+        return None
+
     def of_values(self, given: Sequence[Value], cotangents: Sequence[Value], kind: Value) -> Sequence[Value]:
         """The cotangents of values that each trajectory has: see `sympflow.kernels.runs.OfValues`."""
         return cotangents[: self.own]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property, lru_cache, partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 from weakref import ref
 
 import numpy as np
@@ -24,7 +24,7 @@ from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL, Scheme
 
 if TYPE_CHECKING:
     from sympflow.kernels.approximations import Ranges
-    from sympflow.kernels.reverse import Recorded
+    from sympflow.kernels.reverse import Chained, Recorded
     from sympflow.kernels.rollouts import SplittingRollouts
     from sympflow.kernels.splittings import Splitting
     from sympflow.kernels.stage_times import Driving
@@ -363,11 +363,13 @@ class SplittingKernel(Kernel):
     def check_reverse(self) -> None:
         self._code.check_reverse()
 
-    def recorded(self, task: Task) -> Recorded:
+    def recorded(self, task: Task) -> Chained | Recorded:
         """`runs`, as a run whose cotangents can be pulled back: after `check_reverse`."""
         from sympflow.kernels.reverse import Recorded
 
         table, rows = self.table(task.h, task.t0), self._rows(task)
+        if (own := self._code.chained(self, task, table)) is not None:
+            return cast("Chained", own)
         work = table.shape[1] * self.loops.work / self.loops.abreast
         return Recorded(self._code, table, task.y0 if rows is None else rows, task.n_steps, task.save, work)
 

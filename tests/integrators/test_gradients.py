@@ -22,6 +22,16 @@ RELATIVISTIC = HamiltonianSystem.from_sympy("sqrt(1 + p**2) + q**4/4")
 KEPLER = HamiltonianSystem.from_sympy("(p1**2 + p2**2)/2 - 1/sqrt(q1**2 + q2**2 + 0.3)")
 GEODESIC = HamiltonianSystem.from_sympy("(p1**2 + p2**2)/2*(1 + q1**2) + (q1**4 + q2**4)/4")
 BODIES = HamiltonianSystem.pairs("-m1*m2/sqrt(r**2 + 0.3)", masses=[1.0, 0.5, 0.3], dim=2)
+RING = HamiltonianSystem.lattice(shape=9, onsite="q**2/2", bond="r**2/2 + r**4/4", kinetic="sqrt(1 + p**2)")
+PLATE = HamiltonianSystem.lattice(
+    shape=(5, 4),
+    fields=("u", "w"),
+    onsite="u**2*w**2/2 + u**2",
+    bond={1: "(r_u**2 + r_w**2)/2", 2: "r_u**4/8"},
+    kinetic="(m*p_u**2 + p_w**2)/2",
+    params={"m": np.linspace(0.5, 1.0, 20).reshape(5, 4)},
+    boundary=("free", "fixed"),
+)
 FLOWS = [
     named("henon_heiles-primed-1-0.82").load(henon_heiles()),
     named("driven_pendulum-primed-6-0.4").load(driven_pendulum()),
@@ -47,6 +57,8 @@ SYSTEMS = [
     (GEODESIC, "tao4"),
     (DRIVEN, "kahan_li8_parts"),
     *((flow.system, flow) for flow in FLOWS),
+    (RING, "kahan_li8"),
+    (PLATE, "chin4c"),
     (KEPLER, SympFlow(ndof=2, pairs=2, hidden=(7, 5), activation="swish", dt=0.1).requires_grad_(False)),
 ]
 RUNS = [
