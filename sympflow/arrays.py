@@ -190,7 +190,7 @@ def unfollowed(x: Array) -> Array:
     import torch
 
     with torch._C._DisableFuncTorch():
-        return plain.permute(order)[(0,) * (plain.ndim - x.ndim)]
+        return plain.permute(tuple(order))[(0,) * (plain.ndim - x.ndim)]
 
 
 def lanes(x: Array) -> int:
