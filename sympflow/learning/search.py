@@ -442,9 +442,14 @@ class Search:
             f"{held.complaint}."
         )
         free = None
+
+        def over() -> bool:
+            deadline.check()  # raises OutOfTime
+            return False
+
         with suppress(OutOfTime):
-            deadline.check()
-            free = self.freedom(replace(self.setting, stop=deadline.check))
+            over()
+            free = self.freedom(replace(self.setting, stop=over))
         if free is not None:
             what = "H without the time" if free.defect < SYMPLECTIC else "symplectic map"
             said += f" No {what} explains these data: {free.said} leaves {free.share:.1e} of the sum of squares."
