@@ -157,7 +157,7 @@ def coefficients(
     late, distance = reached(X, G, r, eta, zeta, mu, t, fall)
     slope = 1.0 / distance
     d = -(late * slope)
-    end = slope * (1.0 - (slope * d) * (eta * G0 + zeta * G1))
+    end = slope - (slope * d) * (slope * (eta * G0 + zeta * G1))  # 1 less a small number is rounded with a bias
     G1, G2, G3 = G1 + d * G0, G2 + d * G1, G3 + d * G2
     a = mu * G2
     f, g, df = -(a * inverse), t - mu * G3, -(mu * G1 * inverse * end)
