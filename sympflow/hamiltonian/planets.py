@@ -265,7 +265,7 @@ class Frame:
         d, u = (y[near] - y[far] for y in felt)
         r = np.linalg.norm(d, axis=-1)
         close = r < MOON * np.maximum(self.hill_radii(one, one, 0.0), self.hill_radii(other, other, 0.0))
-        bound = close & ((u * u).sum(-1) / 2 < self.G * (self.masses[one] + self.masses[other]) / r)
+        bound = close & ((u * u).sum(-1) / 2 * r < self.G * (self.masses[one] + self.masses[other]))
         if not bound.any():
             return None
         first, second = sorted(int(i[bound][0]) for i in (one, other))
@@ -537,6 +537,10 @@ def checked_planets(masses: Any, elements: Any, y0: Any, G: Any, units: Any) -> 
     y0 = np.array(to_numpy(y0), dtype=float)
     if y0.shape != (6 * len(masses),) or not np.isfinite(y0).all():
         raise ValueError(f"`y0` must be a finite state [q, p] of shape ({6 * len(masses)},); got shape {y0.shape}.")
+    places = y0[: 3 * len(masses)].reshape(-1, 3)
+    at_star = (places[1:] == places[0]).all(-1)
+    if at_star.any():
+        raise ValueError(f"`y0` has body {1 + int(np.argmax(at_star))} at the place of the star: move it from there.")
     return masses, G, y0
 
 

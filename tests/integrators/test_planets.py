@@ -181,6 +181,7 @@ BAD = [
     ({"elements": {"a": [1, 2, 3], "e": [0.1, -0.2, 0]}}, "`elements` of planet 2 .* negative"),
     ({"elements": {"a": [1, 2, 3], "e": [0.1, 1.2, 0]}}, "`elements` of planet 2 .* wrong sign"),
     ({"elements": {"a": [1, 2, 3], "inc": [7.0, 0, 0]}}, "`elements` of planet 1 .* radians"),
+    ({"elements": None, "y0": np.zeros(24)}, "`y0` has body 1 at the place of the star"),
     ({"elements": {"a": [1, 2, np.nan]}}, "`elements` of planet 3 .* finite"),
     ({"G": -1.0}, "`G` must be positive"),
     ({"units": "AU, day, solar mass"}, "`units` determine `G`"),
