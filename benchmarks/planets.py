@@ -435,7 +435,7 @@ def figure(path: Path) -> None:
     axes[0].set_ylabel("eccentricity")
     axes[1].set_ylabel("inclination / °")
     axes[1].set_xlabel("time / 1000 years")
-    axes[0].legend(ncols=4, fontsize=8, loc="upper right")
+    fig.legend(*axes[0].get_legend_handles_labels(), ncols=4, fontsize=8, loc="outside upper center")
     fig.savefig(path, dpi=110, metadata={"Software": None})
     print(f"{path}: relative energy error {np.abs(sol.energy_error()).max():.1e}")
 
