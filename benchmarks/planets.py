@@ -6,6 +6,7 @@
     python benchmarks/planets.py --asteroids                       bodies without mass, on all cores
     python benchmarks/planets.py --secular                         secular frequencies from 20 million years, minutes
     python benchmarks/planets.py --billion outer.store             a billion years of the outer planets, ten minutes
+    python benchmarks/planets.py --rounding                        energy errors of single planets, a minute
     python benchmarks/planets.py --figure docs/figures/planets.png eccentricities over 200,000 years
     python benchmarks/planets.py --belt docs/figures/belt.png      asteroids over 100,000 years, four minutes
 
@@ -449,6 +450,7 @@ def main() -> None:
     parser.add_argument("--long", action="store_true", help="compare states after 100,000 years, and trained flows")
     parser.add_argument("--secular", action="store_true", help="find the secular frequencies of the outer planets")
     parser.add_argument("--billion", type=Path, metavar="STORE", help="run the outer planets over 1e9 years")
+    parser.add_argument("--rounding", action="store_true", help="measure the rounding of single planets, a minute")
     parser.add_argument("--figure", type=Path, help="draw this picture, and nothing else")
     parser.add_argument("--belt", type=Path, help="draw that of asteroids, and nothing else")
     fragments.add_out(parser)
@@ -465,7 +467,10 @@ def main() -> None:
         fragments.write(given.out, "planets-secular", text)
         return
     if given.billion:
-        fragments.write(given.out, "planets-billion", "\n\n".join([billion(given.billion), rounding()]))
+        fragments.write(given.out, "planets-billion", billion(given.billion))
+        return
+    if given.rounding:
+        fragments.write(given.out, "planets-rounding", rounding())
         return
     if given.long:
         fragments.write(given.out, "planets-trained", trained())
