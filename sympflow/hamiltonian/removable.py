@@ -337,7 +337,7 @@ def _square(f: sp.Expr) -> sp.Expr:
     f = f.replace(lambda e: e.is_Add, _hyperbolic)
     constant, term = f.as_independent(*(wave for wave in f.atoms(sp.Function)), as_Add=True)
     for wave, touched, product in _SQUARES:
-        for a in {each.args[0] for each in term.atoms(sp.Function)}:
+        for a in {each.args[0] for each in term.atoms(sp.cos, sp.sin, sp.cosh)}:
             factor = term / wave(a)
             if not factor.has(sp.Function) and sp.expand(constant + touched * factor) == 0:
                 return factor * product(a)

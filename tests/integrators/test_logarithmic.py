@@ -248,3 +248,10 @@ def test_states_of_an_infinite_energy(backend):
         assert (sol.status, sol.stats["failed_at"]) == (-1, 0.0)
     batch = solve(system, "log_leapfrog", (0.0, 0.2), y0=[[*still, 0.1], [*still, 2e154]], backend=backend)
     assert batch.status.tolist() == [0, -1]
+
+
+def test_a_potential_that_is_0_over_0_has_a_logarithm():
+    system = HamiltonianSystem.from_sympy("p**2/2 + sin(q)/q", y0=[1.0, 0.1])
+    expected = solve(system, "kahan_li8", (0.0, 5.0), dt=0.02).y[:, -1]
+    found = solve(system, "log_kahan_li8", (0.0, 5.0), dt=0.02, t_eval=[5.0]).y[:, -1]
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-11)
