@@ -230,7 +230,8 @@ def _read(text: str, params: Mapping[str, float], timed: bool, names: Sequence[s
 def _lettered(read: _Read, params: Mapping[str, float]) -> TracedHamiltonian:
     """The form of H = ½ pᵀM⁻¹p + V(q) with its letters as parameters."""
     (H,), inputs, d, n = read.H.program.outputs, read.H.program.inputs, read.ndof, read.timed + 2 * read.ndof
-    letters, values = [*read.letters], values_of([*read.letters.values()], params)
+    values = values_of([*read.letters.values()], params)
+    letters = [Variable(f"parameter_{i}") for i in range(len(values))]  # "a" is that of a drift
     own, within = inputs[n:], {x.order for x in reached([H])}
     _, M = kinetic_matrix(H, inputs[:n], d, own, values)
     if M is None or len(Program(inputs, gradient(H, inputs[read.timed : n]))) > MOST_OPERATIONS:
