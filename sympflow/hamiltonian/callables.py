@@ -39,13 +39,13 @@ from sympflow.hamiltonian.formulas import (
     MOST_COMPILED,
     TracedHamiltonian,
     TracedPoles,
-    Variable,
     kinetic_matrix,
     without_overflow,
 )
 from sympflow.hamiltonian.function_checks import Tested, check_writes, probe_states, test
 from sympflow.hamiltonian.layered import LayeredPotential
 from sympflow.hamiltonian.linear_part import simplest
+from sympflow.hamiltonian.quantities import Variable
 from sympflow.hamiltonian.times import probe_times
 
 MOST_BY_ARRAYS = 2000  # operations of a gradient, beyond which torch differentiates its own functions of arrays

@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import cached_property
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -31,6 +31,7 @@ from sympflow.compiler.program import (
     tangent,
     traced,
 )
+from sympflow.hamiltonian.quantities import Formula, Variable
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.poles import Poles
@@ -46,57 +47,6 @@ _OF_FIRST = "pow log log1p tan sqrt acos asin acosh atanh gamma lgamma digamma e
 _SINGULAR = {"div": 1} | dict.fromkeys(_OF_FIRST.split(), 0)
 """The argument by which an operation is infinite or no number."""
 _AS_THEIR_ARGUMENTS = {"abs", "neg", "sqrt", "pow", "mul", "times"}
-_POLYNOMIAL = {"add", "sub", "mul", "times", "neg", "fma"}
-
-
-class Variable(NamedTuple):
-    """A variable of a formula."""
-
-    name: str
-
-
-class Formula:
-    """A function of variables, those of the inputs of a program of one output."""
-
-    def __init__(self, program: Program, variables: Sequence[Variable]) -> None:
-        self.program, self.variables = program, tuple(variables)
-
-    @cached_property
-    def _text(self) -> str:
-        return str(self.program)
-
-    def __str__(self) -> str:
-        return self._text
-
-    def __hash__(self) -> int:
-        return hash(self._text)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Formula) and self._text == other._text
-
-    def __len__(self) -> int:
-        return len(self.program)
-
-    def value(self, known: Mapping[Any, Any]) -> Any:
-        """The value, of numbers for the variables."""
-        return self.program(*(known[s] for s in self.variables))[0]
-
-    def diff(self, variable: Variable) -> Formula:
-        """The derivative by a variable."""
-        program = self.program
-        (slope,) = gradient(program.outputs[0], [program.inputs[self.variables.index(variable)]])
-        return Formula(Program(program.inputs, [slope]), self.variables)
-
-    def is_polynomial(self, *variables: Variable) -> bool:
-        """True if the program has sums and products alone."""
-
-        def is_simple(x: Traced) -> bool:
-            if x.name == "pow":
-                n = x.args[1]
-                return isinstance(n, float) and n >= 0 and n % 1 == 0
-            return x.name in _POLYNOMIAL or (x.name == "div" and isinstance(x.args[1], float))
-
-        return all(map(is_simple, self.program.operations))
 
 
 class Entries:
@@ -552,35 +502,6 @@ def without(
         Program([*inputs, *letters.values()], [of[y.order] if isinstance(y, Traced) else y]),
         (*(s for s, _ in others), *own.values()),
     )
-
-
-KINDS = (0.0, 1.0, -1.0)
-"""Values of parts of H that depend on parameters alone with which H may have another structure."""
-
-
-def values_of(parts: Sequence[Formula], params: Mapping[str, float]) -> list[float]:
-    """Values of parts of H that depend on parameters alone, NaN where they are no numbers."""
-    with np.errstate(all="ignore"):
-        return [float(part.value({s: np.float64(params[s.name]) for s in part.variables})) for part in parts]
-
-
-def revalued(
-    parts: Sequence[Formula],
-    replaced: set[str],
-    letters: Sequence[Formula],
-    before: Mapping[str, float],
-    params: Mapping[str, float],
-) -> tuple[float, ...] | None:
-    """Values of the `letters` of H with others of its parameters; None where H may have another structure.
-
-    `parts` are all that depend on parameters alone, those that are 0, 1 or −1 too; `replaced` are numbers in H.
-    """
-    changed = {name for name, value in before.items() if params[name] != value}
-    lasting = [part for part in parts if part not in letters]
-    if changed & replaced or any(s.name in changed for part in lasting for s in part.variables):
-        return None
-    numbers = tuple(values_of(letters, params))
-    return numbers if all(math.isfinite(x) and x not in KINDS for x in numbers) else None
 
 
 def _kinetic(M: Sequence[Sequence[Any]], p: Sequence[Any]) -> Any:

@@ -14,7 +14,7 @@ import numpy as np
 
 from sympflow.arrays import differentiable, expanded, transformed, without_torch
 from sympflow.compiler import NotCompiled
-from sympflow.hamiltonian.formulas import Formula
+from sympflow.hamiltonian.quantities import Formula
 from sympflow.hamiltonian.scales import size_of_terms
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.lazy import lately_kept

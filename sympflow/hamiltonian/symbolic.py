@@ -33,7 +33,6 @@ from sympflow.hamiltonian.driving import (
     with_symbols,
 )
 from sympflow.hamiltonian.expression import COORDINATE, FUNCTIONS, complex_part, of_sympy, stated
-from sympflow.hamiltonian.formulas import Formula, Variable, revalued, values_of
 from sympflow.hamiltonian.jumps import (
     MOST_IMPULSES,
     MOST_POINTS,
@@ -50,6 +49,7 @@ from sympflow.hamiltonian.jumps import (
 )
 from sympflow.hamiltonian.parameters import LARGEST, Samples, check_span, checked_params
 from sympflow.hamiltonian.poles import Poles, SymbolicPoles
+from sympflow.hamiltonian.quantities import Formula, Variable, revalued, values_of
 from sympflow.hamiltonian.recorded import recorded
 from sympflow.hamiltonian.removable import BOUNDED, Max, cancelling, exact, may_cancel, removed, with_values
 from sympflow.show.cards import cut

@@ -19,20 +19,10 @@ from sympflow.arrays import Array
 from sympflow.compiler.functions import apply
 from sympflow.compiler.program import Program, Recording, Traced, gradient, reached, traced
 from sympflow.hamiltonian.definition import Definition
-from sympflow.hamiltonian.formulas import (
-    KINDS,
-    Formula,
-    TracedHamiltonian,
-    TracedPoles,
-    Variable,
-    evaluator,
-    kinetic_matrix,
-    revalued,
-    values_of,
-    without,
-)
+from sympflow.hamiltonian.formulas import TracedHamiltonian, TracedPoles, evaluator, kinetic_matrix, without
 from sympflow.hamiltonian.grammar import COORDINATE, chain, parsed
 from sympflow.hamiltonian.linear_part import simplest
+from sympflow.hamiltonian.quantities import KINDS, Formula, Variable, revalued, values_of
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.symbolic import SymbolicHamiltonian

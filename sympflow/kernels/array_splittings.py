@@ -14,8 +14,8 @@ from sympflow.compiler.arrange import Arranged
 from sympflow.compiler.control import INT, POINTER, Rows, Value
 from sympflow.compiler.functions import added, fma
 from sympflow.compiler.program import gradient, traced
-from sympflow.hamiltonian.formulas import Variable
 from sympflow.hamiltonian.monomials import Monomials
+from sympflow.hamiltonian.quantities import Variable
 from sympflow.kernels.rollouts import SplittingRollouts
 from sympflow.kernels.runs import Room
 from sympflow.kernels.splittings import Splitting, SplittingCode

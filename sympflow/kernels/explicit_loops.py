@@ -12,7 +12,8 @@ import numpy as np
 from sympflow.compiler import NotCompiled
 from sympflow.compiler.control import DOUBLE, POINTER, Rows, Value
 from sympflow.compiler.program import Program, gradient
-from sympflow.hamiltonian.formulas import Variable, recorded
+from sympflow.hamiltonian.formulas import recorded
+from sympflow.hamiltonian.quantities import Variable
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.one_steps import (
     OneStep,
