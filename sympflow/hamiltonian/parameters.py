@@ -195,7 +195,8 @@ def checked_params(params: Mapping[str, Any] | None) -> dict[str, Any]:
     for name, given in (params or {}).items():
         name = name.name if isinstance(name, symbol) else name  # noqa: PLW2901
         if not isinstance(name, str) or COORDINATE.fullmatch(name) or name == "t":
-            raise ValueError(f"`params` gives a value to {name!r}, which is {'the time' if name == 't' else 'a coordinate'}: rename the parameter.")
+            kind = "the time" if name == "t" else "a coordinate"
+            raise ValueError(f"`params` gives a value to {name!r}, which is {kind}: rename the parameter.")
         if is_spline(given):
             checked[name] = Samples.of(name, given)
             continue
