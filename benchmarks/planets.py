@@ -408,15 +408,8 @@ def rounding(years: float = 1e6) -> str:
             spread = [f"{np.sqrt(np.mean(energy[1 : 1 + k] ** 2)):.1e}" for k in (10, 100, 1000)]
             lines.append([f"{e:g}", f"{steps:.0f}", f"{n:.0e}", *spread])
             print(*lines[-1], flush=True)
-    titles = [
-        "eccentricity",
-        "steps a period",
-        "steps",
-        "energy error, rms, after a hundredth of them",
-        "a tenth",
-        "all",
-    ]
-    return fragments.table(titles, lines)
+    spans = ["energy error, rms, after a hundredth of them", "a tenth", "all"]
+    return fragments.table(["eccentricity", "steps a period", "steps", *spans], lines)
 
 
 def figure(path: Path) -> None:

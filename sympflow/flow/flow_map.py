@@ -548,7 +548,7 @@ class FlowMap(KnownFlow, Shown, nn.Module):
         Parameters
         ----------
         system : HamiltonianSystem, optional
-            The system that it was trained for; by default the one that it holds. Without one there is no energy.
+            The system that it was trained for; by default the one that it holds. The energy is left out if it has none.
 
         Raises
         ------

@@ -94,7 +94,7 @@ class MLPFlow(FlowMap):
         return cls(ndof, hidden, str(plan.get("activation")), dt, dtype)
 
     def forward(self, t: float | Tensor, x: Tensor, t0: Any = None) -> Tensor:
-        """ψ_t(x) for t ≥ 0, extended beyond Δt as SympFlow is; for t < 0 a ValueError, because there is no inverse."""
+        """ψ_t(x) for t ≥ 0, extended beyond Δt as SympFlow is; t < 0 raises ValueError, since it has no inverse."""
         checked = self._checked_time(t, x)
         negative = checked < 0 if isinstance(checked, float) else bool((to_values(checked) < 0).any())
         if negative:

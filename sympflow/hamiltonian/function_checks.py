@@ -1,7 +1,7 @@
 """Checks of the functions that define H: derivatives against differences, batches against single states, repetition.
 
 They run once for a system, at a few states, and cost milliseconds. A function passes unless it is certainly wrong:
-next to a kink or a singularity, or where rounding hides the answer, there is no message.
+next to a kink or a singularity, or where rounding hides the answer, they stay silent.
 """
 
 from __future__ import annotations

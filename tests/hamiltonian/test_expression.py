@@ -167,6 +167,43 @@ def test_sums_are_the_same_however_they_are_grouped(text, monkeypatch):
     assert sp.expand(read(text) - expected) == 0
 
 
+SINC = [
+    ("sinc(q)", 1.0, 1.0),
+    ("sin(q)/q", 1.0, 1.0),
+    ("3*sin(q)/(2*q)", 1.5, 1.0),
+    ("sin(3*q)/q", 3.0, 3.0),
+    ("sin(k*q)/q", 1.3, 1.3),
+    ("sin(k*q)/(k*q)", 1.0, 1.3),
+]
+"""V, and c, k with V = c sin(kq)/(kq); that of a cosine below, c (sin(kq)/(kq))²."""
+SQUARES = [
+    ("(1 - cos(q))/q**2", 0.5, 0.5),
+    ("1/q**2 - cos(q)/q**2", 0.5, 0.5),
+    ("sin(q)**2/q**2", 1.0, 1.0),
+    ("(cos(k*q) - 1)/(k*q)**2", -0.5, 0.65),
+]
+
+
+@cache
+def of_sinc(V):
+    return HamiltonianSystem.from_sympy(f"p**2/2 + {V}", params={"k": 1.3} if "k*" in V else None)
+
+
+@pytest.mark.parametrize("q", [0.0, 1e-20, 1e-9, -1e-4, 0.3])
+@pytest.mark.parametrize(("V", "c", "k", "n"), [(*row, 1) for row in SINC] + [(*row, 2) for row in SQUARES])
+def test_sinc_and_what_is_written_for_it_are_right_near_zero(V, c, k, n, q):
+    system = of_sinc(V)
+    with mpmath.workdps(100):
+        value = [float(mpmath.diff(lambda x: c * mpmath.sinc(k * x) ** n, q, order)) for order in range(3)]
+    y = np.array([[q, 0.7], [q, 0.0]])
+    np.testing.assert_allclose(system.potential(y[:, :1]), value[0], rtol=1e-15)
+    np.testing.assert_allclose(-system.force(y[:, :1])[0], value[1], rtol=2e-15)
+    np.testing.assert_allclose(system.hessian(y)[0, 0, 0], value[2], rtol=2e-15)
+    tensor = torch.tensor(y, requires_grad=True)
+    (gradient,) = torch.autograd.grad(system.hamiltonian(tensor).sum(), tensor)
+    np.testing.assert_allclose(gradient.numpy(), system.gradient(y), rtol=1e-14)
+
+
 REMOVABLE = [
     *("sinc(q)", "3*sin(q)/(2*q)", "sin(k*q)/(k*q)", "(cos(k*q) - 1)/(k*q)**2", "1/q**2 - cos(q)/q**2"),
     *("sin(q)**2/q**2", "tan(q)/q", "tanh(q)/q", "atan(k*q)/q", "erf(q)/q", "q*csch(q)", "q/(exp(q) - 1)", "q*cot(q)"),

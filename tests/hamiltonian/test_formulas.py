@@ -183,22 +183,29 @@ def slopes(system):
     return newton_code(lettered(system.symbols, [system.symbols.H]), gauss_legendre(1), False, False).slopes
 
 
-@pytest.mark.parametrize("seed", range(25))
+REFUSED = (2, 18, 21, 22, 24)  # seeds of formulas that jump, or are not real
+
+
+@pytest.mark.parametrize("seed", [seed for seed in range(30) if seed not in REFUSED])
 def test_derivatives_of_random_formulas_are_those_of_H_and_of_compiled_code(seed):
     text = formula(random.Random(seed), 2)
-    try:
-        system = made(f"p1**2/2 + p2**2/2 + a*q1 + {text}", params={"a": 0.6})
-    except ValueError:  # of one that is nowhere real
-        pytest.skip("refused")
+    system = made(f"p1**2/2 + p2**2/2 + a*q1 + {text}", params={"a": 0.6})
     with np.errstate(all="ignore"):
         g, h = system.gradient(Y), system.hessian(Y)
-        if not (np.isfinite(g).all() and np.isfinite(h).all() and np.abs(h).max() < 1e6):
-            pytest.skip("not defined there")
         differences = [(system.hamiltonian(Y + d) - system.hamiltonian(Y - d)) / 2e-5 for d in 1e-5 * np.eye(4)]
+    assert np.isfinite(g).all()
+    assert np.isfinite(h).all()
     np.testing.assert_allclose(g, differences, rtol=1e-4, atol=1e-5)
     found = slopes(system)(*Y.tolist())
     np.testing.assert_allclose(found[:4], g, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(found[4:], h[np.triu_indices(4)], rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("seed", REFUSED)
+def test_random_formulas_that_jump_or_are_not_real_are_refused(seed):
+    text = formula(random.Random(seed), 2)
+    with pytest.raises(ValueError, match=r"`expression` jumps where|is not a finite real one"):
+        made(f"p1**2/2 + p2**2/2 + a*q1 + {text}", params={"a": 0.6})
 
 
 @pytest.mark.parametrize("q", [0.0, 1e-9, 1e-4, 0.999, 1.001, 30.0])
